@@ -135,7 +135,7 @@ def exact_noise(avoid: Array, root: Array, rng: Rng) -> Array:
 
     Notes
     -----
-    A plain draw is projected onto what is orthogonal over the members to the constant and to the
+    A plain draw is projected onto the complement, over the members, of the constant and of the
     anomalies, orthonormalised, which is whitening by the Cholesky factor of its own covariance, and
     coloured: :math:`\sqrt{N-1}\,\mathbf Q\mathbf L^\top` with :math:`\mathbf P=\mathbf L
     \mathbf L^\top`. :math:`\mathbf Q` is distributed uniformly over the orthonormal frames there.

@@ -216,7 +216,14 @@ def _solve_triangular(lower: Array, right: Array, *, transposed: bool) -> Array:
     else:
         solution = np.empty((n, d, k))
         for i in range(n):
-            solution[i] = _solve_one_factor(factors[i], sides[i], transposed)
+            if d <= _SMALL and k > 200 * d:
+                solution[i] = _solve_one_factor(factors[i], sides[i], transposed)
+            else:
+                solution[i], failed = dtrtrs(
+                    factors[i], sides[i], lower=1, trans=int(transposed)
+                )
+                if failed:
+                    raise np.linalg.LinAlgError("Singular matrix")
     return solution.reshape(*leading, d, k)
 
 

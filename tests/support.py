@@ -1,4 +1,4 @@
-"""What tests of several rooms share: random covariances, their comparison, and bad values."""
+"""Random covariances, their comparison, wrong values and a model, for several tests."""
 
 from __future__ import annotations
 
@@ -53,16 +53,16 @@ def turning(*, sigma: float, turn_sigma: float) -> Model:
     """Position, velocity and turn rate in the plane: a turn at constant speed, not linear."""
     straight = constant_velocity(sigma=sigma)
 
-    def flow(x: np.ndarray, t: float, dt: float) -> np.ndarray:
+    def transition(x: np.ndarray, t: float, dt: float) -> np.ndarray:
         p = x[..., :2]
         v = x[..., 2:4]
         tau = x[..., 4:] * dt
-        left = np.stack([-v[..., 1], v[..., 0]], axis=-1)
+        normal = np.stack([-v[..., 1], v[..., 0]], axis=-1)
         along = np.sinc(tau / np.pi)
-        aside = 0.5 * tau * np.sinc(0.5 * tau / np.pi) ** 2
-        moved = p + dt * (along * v + aside * left)
+        across = 0.5 * tau * np.sinc(0.5 * tau / np.pi) ** 2
+        position = p + dt * (along * v + across * normal)
         return np.concatenate(
-            [moved, np.cos(tau) * v + np.sin(tau) * left, x[..., 4:]], axis=-1
+            [position, np.cos(tau) * v + np.sin(tau) * normal, x[..., 4:]], axis=-1
         )
 
     def derivative(x: np.ndarray, t: float, dt: float) -> np.ndarray:
@@ -71,18 +71,18 @@ def turning(*, sigma: float, turn_sigma: float) -> Model:
             x[..., 2:4, None],
         )  # turns that are not tiny
         one = np.eye(2)
-        left = np.array([[0.0, -1.0], [1.0, 0.0]])
+        normal = np.array([[0.0, -1.0], [1.0, 0.0]])
         sine = np.sin(tau) / tau
         cosine = (1 - np.cos(tau)) / tau
-        out = np.zeros((*x.shape, 5))
-        out[..., :2, :2] = one
-        out[..., 4, 4] = 1.0
-        out[..., :2, 2:4] = dt * (sine * one + cosine * left)
-        out[..., 2:4, 2:4] = np.cos(tau) * one + np.sin(tau) * left
-        bent = (np.cos(tau) - sine) * one + (np.sin(tau) - cosine) * left
-        out[..., :2, 4:] = dt**2 / tau * (bent @ v)
-        out[..., 2:4, 4:] = dt * (-np.sin(tau) * one + np.cos(tau) * left) @ v
-        return out
+        jacobian = np.zeros((*x.shape, 5))
+        jacobian[..., :2, :2] = one
+        jacobian[..., 4, 4] = 1.0
+        jacobian[..., :2, 2:4] = dt * (sine * one + cosine * normal)
+        jacobian[..., 2:4, 2:4] = np.cos(tau) * one + np.sin(tau) * normal
+        bent = (np.cos(tau) - sine) * one + (np.sin(tau) - cosine) * normal
+        jacobian[..., :2, 4:] = dt**2 / tau * (bent @ v)
+        jacobian[..., 2:4, 4:] = dt * (-np.sin(tau) * one + np.cos(tau) * normal) @ v
+        return jacobian
 
     def noise(t: float, dt: float) -> np.ndarray:
         cov = np.zeros((5, 5))
@@ -90,7 +90,7 @@ def turning(*, sigma: float, turn_sigma: float) -> Model:
         cov[4, 4] = turn_sigma**2 * dt
         return cov
 
-    return Model(5, flow, noise, derivative=derivative)
+    return Model(5, transition, noise, derivative=derivative)
 
 
 def without_checks(function: Callable[..., Any]) -> Callable[..., Any]:

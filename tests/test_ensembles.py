@@ -31,8 +31,8 @@ def test_moments_are_their_definitions() -> None:
         assert np.allclose(
             center_ensemble(x)[1][k], x[k] - x[k].mean(axis=0), atol=1e-14
         )
-        both = np.cov(x[k], rowvar=False)
-        assert np.allclose(sample_covariance(x)[k], both, rtol=1e-12, atol=1e-13)
+        joint = np.cov(x[k], rowvar=False)
+        assert np.allclose(sample_covariance(x)[k], joint, rtol=1e-12, atol=1e-13)
     assert (sample_covariance(x) == sample_covariance(x).swapaxes(-1, -2)).all()
     assert mean(x[:, :1]).shape == (2, 3) and (center_ensemble(x[:, :1])[1] == 0).all()
 
@@ -71,18 +71,18 @@ def test_draws_of_a_singular_covariance_stay_in_its_range() -> None:
 
 
 def _exact(avoid: np.ndarray, cov: np.ndarray, noise: np.ndarray) -> None:
-    """Centred, without correlation to what is avoided, with covariance `cov`: all to 1e-12."""
+    """Mean 0, no correlation with `avoid`, covariance `cov`: all to 1e-12."""
     std = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
     std = np.where(std > 0, std, 1.0)
     assert np.abs(mean(noise) / std).max(initial=0) < 1e-12
-    found = sample_covariance(noise)
-    assert unit_gap(found, np.broadcast_to(cov, found.shape)) < 1e-12
+    covariance = sample_covariance(noise)
+    assert unit_gap(covariance, np.broadcast_to(cov, covariance.shape)) < 1e-12
     if avoid.shape[-1]:
         length = avoid.std(axis=-2, ddof=1)
         length = np.where(length > 0, length, 1.0)
-        gap = center_ensemble(avoid)[1].mT @ noise / (avoid.shape[-2] - 1)
-        gap /= length[..., :, None] * std[..., None, :]
-        assert np.abs(gap).max() < 1e-12
+        correlation = center_ensemble(avoid)[1].mT @ noise / (avoid.shape[-2] - 1)
+        correlation /= length[..., :, None] * std[..., None, :]
+        assert np.abs(correlation).max() < 1e-12
 
 
 @given(SEEDS, st.integers(0, 5), st.integers(1, 4), st.integers(1, 40), st.data())
@@ -109,14 +109,14 @@ def test_exact_noise_beside_anomalies_that_depend_on_each_other(n: int) -> None:
     x = rng.standard_normal((3, n, 4))
     for slight in (0.0, 1e-12, 1e-9, 1e-6, 1e-3):
         h = x @ rng.standard_normal((4, 8)) + slight * rng.standard_normal((3, n, 8))
-        both = np.concatenate([x, h], axis=-1)
+        joint = np.concatenate([x, h], axis=-1)
         if n == 12 and slight:
             with pytest.raises(
                 ValueError, match=r"must have more than 1[12] \+ 3 members.* got 12$"
             ):
-                exact_noise(both, factor(FULL), rng)
+                exact_noise(joint, factor(FULL), rng)
         else:
-            _exact(both, FULL, exact_noise(both, factor(FULL), rng))
+            _exact(joint, FULL, exact_noise(joint, factor(FULL), rng))
     flat = np.concatenate([x, np.zeros((3, n, 2)), 1e6 + x[..., :1]], axis=-1)
     _exact(flat[..., :6], FULL, exact_noise(flat, factor(FULL), rng))
 
@@ -127,11 +127,11 @@ def test_exact_noise_beside_combinations_of_close_anomalies() -> None:
         rng = generator(seed)
         x = rng.standard_normal((3, 7, 3))
         x[..., 1:] = x[..., :1] + 1e-3 * x[..., 1:]
-        both = np.concatenate([x, x @ [[0.0, 1.0], [1.0, -1.0], [-1.0, 0.0]]], axis=-1)
-        _exact(both, FULL, exact_noise(both, factor(FULL), rng))
+        joint = np.concatenate([x, x @ [[0.0, 1.0], [1.0, -1.0], [-1.0, 0.0]]], axis=-1)
+        _exact(joint, FULL, exact_noise(joint, factor(FULL), rng))
 
 
-def test_exact_noise_says_how_many_members_it_needs() -> None:
+def test_too_few_members_are_refused_with_the_number_needed() -> None:
     x = generator(7).standard_normal((9, 4))
     assert exact_noise(x[:8], factor(FULL), generator()).shape == (8, 3)
     with pytest.raises(
@@ -157,17 +157,17 @@ def test_both_ways_give_the_same_draw(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not np.allclose(fast, exact_noise(x, factor(FULL), generator(10)))
 
 
-def test_exact_noise_is_as_random_as_can_be() -> None:
-    """Uniform over the directions left: each member's mean 0, variance that of the projection."""
+def test_exact_noise_is_uniform_over_the_free_directions() -> None:
+    """Each member has mean 0 and the variance of the projection."""
     rng = generator(12)
     x = rng.standard_normal((8, 2))
     noise = exact_noise(np.broadcast_to(x, (20_000, 8, 2)), factor([[4.0]]), rng)[
         ..., 0
     ]
     basis = np.linalg.qr(np.column_stack([np.ones(8), x]))[0]
-    left = np.eye(8) - basis @ basis.T
-    found = noise.T @ noise / 20_000
+    projection = np.eye(8) - basis @ basis.T
+    covariance = noise.T @ noise / 20_000
     # 7 · 4 is the squared length, spread evenly over 8 - 1 - 2 directions.
-    exact = 4.0 * 7 / 5 * left
-    assert np.abs(found - exact).max() < 6 * 4.0 * 7 / 5 / np.sqrt(20_000)
+    exact = 4.0 * 7 / 5 * projection
+    assert np.abs(covariance - exact).max() < 6 * 4.0 * 7 / 5 / np.sqrt(20_000)
     assert np.abs(noise.mean(axis=0)).max() < 6 * np.sqrt(4.0 * 7 / 5 / 20_000)

@@ -1,4 +1,4 @@
-"""Density, intersection and its weights, recolouring, points, updates: exact identities."""
+"""Density, covariance intersection and its weights, matched moments, points, updates."""
 
 from __future__ import annotations
 
@@ -32,20 +32,21 @@ def test_log_density_is_the_definition(seed: int, d: int) -> None:
     x = rng.standard_normal((4, 3, d))
     centre = rng.standard_normal((3, d))
     cov = spd(rng, d, (3,))
-    found = log_density(x, centre, cov)
-    assert found.shape == (4, 3)
+    logs = log_density(x, centre, cov)
+    assert logs.shape == (4, 3)
     for i in range(3):
         exact = multivariate_normal(centre[i], cov[i]).logpdf(x[:, i])
-        assert np.allclose(found[:, i], exact, rtol=1e-9, atol=1e-9)
-    assert np.allclose(log_density(x, centre, cov[0])[..., 0], found[:, 0])
+        assert np.allclose(logs[:, i], exact, rtol=1e-9, atol=1e-9)
+    assert np.allclose(log_density(x, centre, cov[0])[..., 0], logs[:, 0])
 
 
 # --- intersection -----------------------------------------------------------------------------
 
 
-def _by_inverses(
+def _intersect_by_inverses(
     m: np.ndarray, p: np.ndarray, w: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
+    """P⁻¹ = Σ ω P_b⁻¹ and P⁻¹ m = Σ ω P_b⁻¹ m_b."""
     information = np.linalg.inv(p)
     cov = np.linalg.inv((w[..., None, None] * information).sum(axis=-3))
     vector = (w[..., None] * (information @ m[..., None])[..., 0]).sum(axis=-2)
@@ -60,15 +61,15 @@ def test_intersection_is_the_weighted_sum_of_information(
     m = rng.standard_normal((6, s, d))
     p = spd(rng, d, (6, s))
     w = rng.dirichlet(np.ones(s), 6)
-    found = intersect_gaussians(m, p, w)
-    exact = _by_inverses(m, p, w)
+    fused = intersect_gaussians(m, p, w)
+    exact = _intersect_by_inverses(m, p, w)
     worst = 1e-13 * np.linalg.cond(p).max()
-    assert np.abs(found[0] - exact[0]).max() < 10 * worst
-    assert unit_gap(found[1], exact[1]) < worst
-    assert (found[1] == found[1].swapaxes(-1, -2)).all()
+    assert np.abs(fused[0] - exact[0]).max() < 10 * worst
+    assert unit_gap(fused[1], exact[1]) < worst
+    assert (fused[1] == fused[1].swapaxes(-1, -2)).all()
     one = intersect_gaussians(m[2], p[2], w[2])
-    assert np.allclose(one[0], found[0][2], atol=worst) and np.allclose(
-        one[1], found[1][2]
+    assert np.allclose(one[0], fused[0][2], atol=worst) and np.allclose(
+        one[1], fused[1][2]
     )
     several = intersect_gaussians(m[2], np.stack([p[2], 2 * p[2]]), w[2])
     assert np.allclose(several[0], one[0], atol=worst) and np.allclose(
@@ -110,9 +111,12 @@ def test_extreme_precision_does_not_spoil_the_rest() -> None:
         m = np.stack([np.ones(3), np.zeros(3)])[order]
         mean_, cov = intersect_gaussians(m, np.stack([sharp, wide])[order], [0.5, 0.5])
         assert np.allclose(mean_, 1.0) and unit_gap(cov, 2 * sharp) < 1e-9
-    # Components alike to the last bit: along their sum both count, and rounding hides the rest.
-    alike = (1 + np.eye(2) * 2.0**-52) / 16
-    cov = intersect_gaussians(np.zeros((2, 2)), [np.eye(2), alike], [0.75, 0.25])[1]
+    # Components equal but for the last bit: along their sum both count, and rounding hides the
+    # other directions.
+    nearly_equal = (1 + np.eye(2) * 2.0**-52) / 16
+    cov = intersect_gaussians(
+        np.zeros((2, 2)), [np.eye(2), nearly_equal], [0.75, 0.25]
+    )[1]
     assert np.isclose(cov.sum(), 2 / (0.75 + 0.25 / 0.125))
 
 
@@ -120,26 +124,28 @@ def test_extreme_precision_does_not_spoil_the_rest() -> None:
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_what_did_not_arrive_weighs_nothing_whatever_it_holds(rule: str) -> None:
+def test_an_absent_source_has_weight_zero_for_any_values(rule: str) -> None:
     rng = generator(5)
     p = spd(rng, 3, (4, 5))
     m = rng.standard_normal((4, 5, 3))
-    here = rng.random((4, 5)) < 0.6
-    here[:, 2] = True
-    here[0] = [False, False, True, False, False]
-    here[1, 0] = False
-    here[2, 0] = True
+    present = rng.random((4, 5)) < 0.6
+    present[:, 2] = True
+    present[0] = [False, False, True, False, False]
+    present[1, 0] = False
+    present[2, 0] = True
     for junk in (NAN, 0.0, -3.0):
-        covs = np.where(here[..., None, None], p, junk)
-        means = np.where(here[..., None], m, junk)
-        w = without_checks(intersection_weights)(covs, rule=rule, here=here)
-        assert (w[~here] == 0).all() and np.allclose(w.sum(-1), 1.0, rtol=1e-14)
+        covs = np.where(present[..., None, None], p, junk)
+        means = np.where(present[..., None], m, junk)
+        w = without_checks(intersection_weights)(covs, rule=rule, present=present)
+        assert (w[~present] == 0).all() and np.allclose(w.sum(-1), 1.0, rtol=1e-14)
         assert w[0, 2] == 1.0 and (w >= 0).all()
         fused = without_checks(intersect_gaussians)(means, covs, w)
         for i in range(4):
-            alone = intersection_weights(p[i][here[i]], rule=rule)
-            assert np.allclose(w[i][here[i]], alone, atol=1e-6)
-            one = intersect_gaussians(m[i][here[i]], p[i][here[i]], w[i][here[i]])
+            single = intersection_weights(p[i][present[i]], rule=rule)
+            assert np.allclose(w[i][present[i]], single, atol=1e-6)
+            one = intersect_gaussians(
+                m[i][present[i]], p[i][present[i]], w[i][present[i]]
+            )
             assert np.allclose(fused[0][i], one[0], atol=1e-11)
             assert unit_gap(fused[1][i], one[1]) < 1e-11
 
@@ -157,8 +163,8 @@ def test_closed_forms() -> None:
     )
     for rule in RULES:
         assert intersection_weights(p[:1], rule=rule).tolist() == [1.0]
-    here = np.array([True, False, True])
-    assert intersection_weights(p, present=[here, ~here]).tolist() == [
+    present = np.array([True, False, True])
+    assert intersection_weights(p, present=[present, ~present]).tolist() == [
         [0.5, 0, 0.5],
         [0, 1, 0],
     ]
@@ -195,8 +201,10 @@ def test_optimal_weights_meet_the_conditions_of_the_optimum(
         assert average == pytest.approx(d, rel=1e-9)
 
 
-def test_sure_steps_alone_reach_the_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A Newton step that leads astray is not taken."""
+def test_monotone_steps_alone_reach_the_optimum(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A Newton step that increases the objective is not accepted."""
     p = spd(generator(8), 3, (4, 3))
     exact = intersection_weights(p, rule="min_determinant")
 
@@ -228,7 +236,7 @@ def test_optimal_weights_of_crossed_repeated_and_dominated_sources() -> None:
 
 
 @pytest.mark.parametrize("bad", [NAN, np.inf])
-def test_covariances_that_are_no_numbers_are_refused_where_they_count(
+def test_covariances_with_nan_are_refused_where_they_have_weight(
     bad: float,
 ) -> None:
     p = spd(generator(7), 2, (3,))
@@ -240,10 +248,10 @@ def test_covariances_that_are_no_numbers_are_refused_where_they_count(
     for fuse in (intersect_gaussians, without_checks(intersect_gaussians)):
         with pytest.raises(ValueError, match="^covs must have finite numbers"):
             fuse(np.zeros((3, 2)), p, THIRDS)
-    left = without_checks(intersect_gaussians)(
+    cov = without_checks(intersect_gaussians)(
         np.zeros((3, 2)), p, np.array([0.5, 0.0, 0.5])
     )[1]
-    assert np.isfinite(left).all()
+    assert np.isfinite(cov).all()
 
 
 @given(SEEDS, st.floats(-300, 290))
@@ -258,7 +266,7 @@ def test_optimal_weights_are_numbers_for_any_sizes(seed: int, power: float) -> N
         assert (w >= 0).all() and np.allclose(w.sum(-1), 1.0, rtol=1e-12)
 
 
-# --- recolouring ------------------------------------------------------------------------------
+# --- matched moments --------------------------------------------------------------------------
 
 
 def _ensembles(seed: int, n: int, d: int, leading: tuple[int, ...] = ()) -> np.ndarray:
@@ -271,25 +279,25 @@ def _ensembles(seed: int, n: int, d: int, leading: tuple[int, ...] = ()) -> np.n
 
 
 @given(SEEDS, st.integers(1, 13), st.integers(1, 30))
-def test_recoloured_moments_are_exact(seed: int, d: int, more: int) -> None:
-    """Whatever the condition of the old and the new covariance, down to d + 1 members."""
+def test_matched_moments_are_exact(seed: int, d: int, more: int) -> None:
+    """For any condition of the old and the new covariance, down to d + 1 members."""
     e = _ensembles(seed, d + more, d, (2,))
     other = _ensembles(seed + 1, d + 5, d, (2,))
     centre = mean(other)
     cov = sample_covariance(other)
     try:
-        out = match_moments(e, centre, cov)
+        matched = match_moments(e, centre, cov)
     except ValueError as error:  # members or target flat to rounding
         assert "singular" in str(error) or "definite" in str(error)
         return
     std = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
     rounding = 1e-15 * (np.abs(centre) / std).max()
-    assert np.abs((mean(out) - centre) / std).max() < 1e-13 + 10 * rounding
-    assert unit_gap(sample_covariance(out), cov) < 1e-13 + 100 * rounding
+    assert np.abs((mean(matched) - centre) / std).max() < 1e-13 + 10 * rounding
+    assert unit_gap(sample_covariance(matched), cov) < 1e-13 + 100 * rounding
 
 
-def test_the_draw_that_lost_nine_digits() -> None:
-    """Ill-conditioned old and new covariances at once."""
+def test_moments_are_exact_if_both_covariances_are_ill_conditioned() -> None:
+    """A product of inverses and roots once lost nine digits here."""
     rng = generator(31)
     for d in (3, 12):
         flat = (
@@ -298,11 +306,11 @@ def test_the_draw_that_lost_nine_digits() -> None:
         )
         e = rng.standard_normal((60, d)) @ flat
         target = spd(rng, d, least=1e-10)
-        out = match_moments(e, np.zeros(d), target)
-        assert unit_gap(sample_covariance(out), target) < 1e-13
+        matched = match_moments(e, np.zeros(d), target)
+        assert unit_gap(sample_covariance(matched), target) < 1e-13
 
 
-def test_recolouring_is_symmetric_and_so_moves_the_members_least() -> None:
+def test_matching_moments_is_symmetric_and_so_optimal_transport() -> None:
     """A C A = P has one symmetric positive solution in units of the new standard deviations."""
     e = _ensembles(1, 40, 4)
     other = _ensembles(2, 40, 4)
@@ -357,8 +365,8 @@ def test_points_have_the_moments(d: int, kappa: float) -> None:
     points, w = unscented_points(mean, root, kappa=kappa)
     assert points.shape == (4, 2 * d + 1, d) and np.isclose(w.sum(), 1)
     assert np.allclose(w @ points, mean)
-    gap = points - mean[:, None]
-    assert np.allclose((gap * w[:, None]).mT @ gap, cov)
+    innovation = points - mean[:, None]
+    assert np.allclose((innovation * w[:, None]).mT @ innovation, cov)
     assert np.allclose(points[:, 0], mean) and np.allclose(
         points[:, 1:].mean(axis=1), mean
     )
@@ -378,11 +386,11 @@ M = 3
 def case(seed: int, lead: tuple[int, ...] = ()) -> tuple[np.ndarray, ...]:
     rng = np.random.default_rng(seed)
     mean = rng.standard_normal((*lead, D))
-    gap = rng.standard_normal((*lead, M))
+    innovation = rng.standard_normal((*lead, M))
     return (
         mean,
         spd(rng, D, lead),
-        gap,
+        innovation,
         rng.standard_normal((*lead, M, D)),
         spd(rng, M, lead),
     )
@@ -390,21 +398,32 @@ def case(seed: int, lead: tuple[int, ...] = ()) -> tuple[np.ndarray, ...]:
 
 @given(seed=st.integers(0, 10**6))
 def test_in_information_form_an_update_is_a_sum(seed: int) -> None:
-    mean, cov, gap, h, r = case(seed)
-    x, p = condition(mean, cov, gap, h, r)
+    mean, cov, innovation, h, r = case(seed)
+    x, p = condition(mean, cov, innovation, h, r)
     weight = h.T @ np.linalg.inv(r)
     exact = np.linalg.inv(np.linalg.inv(cov) + weight @ h)
     np.testing.assert_allclose(p, exact, rtol=1e-8, atol=1e-9)
-    np.testing.assert_allclose(x, mean + exact @ weight @ gap, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(
+        x, mean + exact @ weight @ innovation, rtol=1e-8, atol=1e-8
+    )
     assert (p == p.T).all()
 
 
 def test_a_missing_component_is_a_row_left_out() -> None:
-    mean, cov, whole, h, r = case(1)
-    for lost, kept in ((1, [0, 2]), (0, [1, 2])):
-        gap = np.where(np.arange(M) == lost, np.nan, whole)
-        ours = [both[0] for both in condition(mean, cov, gap, h, np.stack([r, 2 * r]))]
-        theirs = condition(mean, cov, gap[kept], h[kept], r[np.ix_(kept, kept)])
+    mean, cov, complete, h, r = case(1)
+    for lost, remaining in ((1, [0, 2]), (0, [1, 2])):
+        innovation = np.where(np.arange(M) == lost, np.nan, complete)
+        ours = [
+            both[0]
+            for both in condition(mean, cov, innovation, h, np.stack([r, 2 * r]))
+        ]
+        theirs = condition(
+            mean,
+            cov,
+            innovation[remaining],
+            h[remaining],
+            r[np.ix_(remaining, remaining)],
+        )
         for a, b in zip(ours, theirs, strict=True):
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
     blind = condition(mean, cov, np.full(M, np.nan), h, r)
@@ -412,28 +431,29 @@ def test_a_missing_component_is_a_row_left_out() -> None:
 
 
 def test_a_batch_is_its_members_one_by_one() -> None:
-    mean, cov, gap, h, r = case(2, (5, 2))
-    gap[np.random.default_rng(3).random(gap.shape) < 0.3] = np.nan
-    x, p = condition(mean, cov, gap, h, r)
+    mean, cov, innovation, h, r = case(2, (5, 2))
+    innovation[np.random.default_rng(3).random(innovation.shape) < 0.3] = np.nan
+    x, p = condition(mean, cov, innovation, h, r)
     for k in np.ndindex(5, 2):
-        alone = condition(mean[k], cov[k], gap[k], h[k], r[k])
-        np.testing.assert_allclose(x[k], alone[0], rtol=0, atol=1e-13)
-        np.testing.assert_allclose(p[k], alone[1], rtol=0, atol=1e-13)
+        single = condition(mean[k], cov[k], innovation[k], h[k], r[k])
+        np.testing.assert_allclose(x[k], single[0], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(p[k], single[1], rtol=0, atol=1e-13)
 
 
 def test_one_covariance_and_one_sensor_serve_any_number_of_means() -> None:
-    mean, gap = np.random.default_rng(4).standard_normal((2, 6, D))
+    mean, innovation = np.random.default_rng(4).standard_normal((2, 6, D))
     _, cov, _, h, r = case(5)
-    x, p = condition(mean, cov, gap[:, :M], h, r)
+    x, p = condition(mean, cov, innovation[:, :M], h, r)
     assert x.shape == (6, D) and p.shape == (D, D)
-    full = condition(mean, np.broadcast_to(cov, (6, D, D)), gap[:, :M], h, r)
+    full = condition(mean, np.broadcast_to(cov, (6, D, D)), innovation[:, :M], h, r)
     np.testing.assert_allclose(x, full[0], rtol=0, atol=1e-13)
     np.testing.assert_allclose(
         np.broadcast_to(p, full[1].shape), full[1], rtol=0, atol=1e-13
     )
 
 
-def test_joseph_s_form_keeps_what_a_nearly_exact_reading_leaves() -> None:
-    mean, cov, gap, _, _ = case(7)
-    p = condition(mean, 1e8 * cov, gap, np.eye(D)[:M], 1e-8 * np.eye(M))[1]
+def test_joseph_s_form_is_accurate_for_a_nearly_exact_observation() -> None:
+    """The posterior variance of an observed component is R, sixteen digits below P."""
+    mean, cov, innovation, _, _ = case(7)
+    p = condition(mean, 1e8 * cov, innovation, np.eye(D)[:M], 1e-8 * np.eye(M))[1]
     np.testing.assert_allclose(p[:M, :M], 1e-8 * np.eye(M), rtol=1e-6, atol=1e-13)

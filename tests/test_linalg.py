@@ -16,11 +16,11 @@ SIZES = st.integers(1, 7)
 EPS = linalg.EPS
 
 
-def _turned(a: np.ndarray) -> np.ndarray:
+def _transpose(a: np.ndarray) -> np.ndarray:
     return np.swapaxes(a, -1, -2)
 
 
-def _solved(cov: np.ndarray, right: np.ndarray) -> np.ndarray:
+def _solve(cov: np.ndarray, right: np.ndarray) -> np.ndarray:
     lower = linalg.cholesky(cov)
     return linalg.solve_upper(lower, linalg.solve_lower(lower, right))
 
@@ -40,7 +40,7 @@ def _log_det(cov: np.ndarray) -> np.ndarray:
 def test_factor_reproduces_its_matrix(seed: int, d: int) -> None:
     cov = spd(generator(seed), d, (2, 3))
     lower = linalg.factor(cov)
-    assert unit_gap(lower @ _turned(lower), cov) < 10 * d * EPS
+    assert unit_gap(lower @ _transpose(lower), cov) < 10 * d * EPS
     assert (np.triu(lower, 1) == 0).all() and (
         np.diagonal(lower, axis1=-2, axis2=-1) > 0
     ).all()
@@ -64,7 +64,7 @@ def test_factor_of_a_singular_matrix_keeps_every_digit(
 
 @pytest.mark.parametrize("nearly", [1e-7, 3e-8, 1e-8, 1e-9])
 def test_factor_where_a_tiny_pivot_decides(nearly: float) -> None:
-    """The second component is the first but for `nearly` times what the third consists of.
+    """The second component is the first, up to `nearly` times the third.
 
     Elimination divides a column by the root of a pivot that rounding has spoilt: a third pivot of
     0.1 below zero would be dropped, and with it a tenth of a variance.
@@ -99,7 +99,7 @@ def test_factor_of_nothing_and_of_a_mixed_stack() -> None:
     assert (linalg.factor(np.zeros((2, 3, 3))) == 0).all()
     mixed = np.stack([spd(generator(), 3), np.ones((3, 3)), np.diag([0.0, 4.0, 0.0])])
     lower = linalg.factor(mixed)
-    assert unit_gap(lower @ _turned(lower), mixed) < 100 * EPS
+    assert unit_gap(lower @ _transpose(lower), mixed) < 100 * EPS
     assert np.allclose(lower[1], [[1, 0, 0], [1, 0, 0], [1, 0, 0]])
     assert lower[2, 1, 1] == 2 and np.count_nonzero(lower[2]) == 1
 
@@ -125,11 +125,11 @@ def test_triangular_solves_of_every_number_of_systems(
     lower.flags.writeable = right.flags.writeable = False
     for solve, matrix in (
         (linalg.solve_lower, lower),
-        (linalg.solve_upper, _turned(lower)),
+        (linalg.solve_upper, _transpose(lower)),
     ):
-        out = solve(lower, right)
-        assert out.shape == right.shape
-        assert np.allclose(matrix @ out, right, rtol=1e-11, atol=1e-11)
+        solution = solve(lower, right)
+        assert solution.shape == right.shape
+        assert np.allclose(matrix @ solution, right, rtol=1e-11, atol=1e-11)
         shared = solve(lower, right[(0,) * len(leading)])
         assert np.allclose(
             matrix @ shared, right[(0,) * len(leading)], rtol=1e-11, atol=1e-11
@@ -149,16 +149,16 @@ def test_whitening_broadcasts_in_every_way(leading: tuple[int, ...]) -> None:
     lower = np.linalg.cholesky(spd(rng, 4, leading))
     for shape in ((*leading, 4), (4,)):
         v = rng.standard_normal(shape)
-        out = linalg.whiten(lower, v)
+        solution = linalg.whiten(lower, v)
         assert np.allclose(
-            (lower @ out[..., None])[..., 0], np.broadcast_to(v, out.shape)
+            (lower @ solution[..., None])[..., 0], np.broadcast_to(v, solution.shape)
         )
     many = rng.standard_normal((*leading, 7, 4))
-    out = linalg.whiten(lower[..., None, :, :], many)
-    assert out.shape == many.shape
-    assert np.allclose((lower[..., None, :, :] @ out[..., None])[..., 0], many)
-    out = linalg.whiten(lower[(0,) * len(leading)], many)
-    assert np.allclose((lower[(0,) * len(leading)] @ out[..., None])[..., 0], many)
+    solution = linalg.whiten(lower[..., None, :, :], many)
+    assert solution.shape == many.shape
+    assert np.allclose((lower[..., None, :, :] @ solution[..., None])[..., 0], many)
+    solution = linalg.whiten(lower[(0,) * len(leading)], many)
+    assert np.allclose((lower[(0,) * len(leading)] @ solution[..., None])[..., 0], many)
 
 
 @pytest.mark.parametrize("leading", [(), (0,), (3,), (0, 2)])
@@ -166,7 +166,7 @@ def test_whitening_broadcasts_in_every_way(leading: tuple[int, ...]) -> None:
 def test_empty_systems(leading: tuple[int, ...], d: int, k: int) -> None:
     cov = np.broadcast_to(np.eye(d), (*leading, d, d))
     right = np.ones((*leading, d, k))
-    assert _solved(cov, right).shape == right.shape
+    assert _solve(cov, right).shape == right.shape
     assert _length(cov, np.ones((*leading, d))).shape == leading
     assert _length(np.eye(d), np.ones((*leading, d))).shape == leading
     assert (
@@ -191,6 +191,11 @@ def test_solves_agree_with_numpy(seed: int, d: int, leading: tuple[int, ...]) ->
 
 
 def test_values_that_wrap_and_large_components() -> None:
-    slope = linalg.central_difference(wrap, np.array([np.pi, 3.0]), lambda a, b: wrap(a - b))
+    slope = linalg.central_difference(
+        wrap, np.array([np.pi, 3.0]), lambda a, b: wrap(a - b)
+    )
     assert np.abs(slope - np.eye(2)).max() < 1e-9
-    assert np.abs(linalg.central_difference(lambda x: 2 * x, np.array([1e9])) - 2).max() < 1e-9
+    assert (
+        np.abs(linalg.central_difference(lambda x: 2 * x, np.array([1e9])) - 2).max()
+        < 1e-9
+    )

@@ -25,11 +25,11 @@ RNG = np.random.default_rng(0)
 def test_leading_axes_broadcast():
     estimates = RNG.standard_normal((7, 3, 6, 2))  # runs, agents, members, components
     truth = RNG.standard_normal((7, 1, 2))
-    whole = crps(estimates, truth)
+    scores = crps(estimates, truth)
     for r in range(7):
         for a in range(3):
             assert np.allclose(
-                whole[r, a], crps(estimates[r, a], truth[r, 0]), rtol=1e-12
+                scores[r, a], crps(estimates[r, a], truth[r, 0]), rtol=1e-12
             )
 
 
@@ -41,13 +41,13 @@ def test_nees_and_nis_are_their_definitions(leading):
     rng = generator(5)
     estimate, truth = rng.standard_normal((2, *leading, 4))
     cov = spd(rng, 4, leading)
-    gap = estimate - truth
-    exact = (gap * np.linalg.solve(cov, gap[..., None])[..., 0]).sum(-1)
+    error = estimate - truth
+    exact = (error * np.linalg.solve(cov, error[..., None])[..., 0]).sum(-1)
     assert nees(estimate, cov, truth).shape == leading
     assert np.allclose(nees(estimate, cov, truth), exact, rtol=1e-10)
-    assert np.allclose(nis(gap, cov), exact, rtol=1e-10)
+    assert np.allclose(nis(error, cov), exact, rtol=1e-10)
     one = cov[(0,) * len(leading)]
-    exact = (gap * np.linalg.solve(one, gap[..., None])[..., 0]).sum(-1)
+    exact = (error * np.linalg.solve(one, error[..., None])[..., 0]).sum(-1)
     assert np.allclose(nees(estimate, one, truth), exact, rtol=1e-10)
     with pytest.raises(ValueError, match="^truth must have leading axes"):
         nees(np.ones((2, 4)), one, np.ones((3, 4)))
@@ -91,13 +91,13 @@ def test_crps_is_its_definition(n):
     x = rng.standard_normal((3, n, 2))
     y = rng.standard_normal((3, 2))
     w = rng.dirichlet([1] * n, 3)
-    found = crps(x, y, weights=w)
+    interval = crps(x, y, weights=w)
     for r in range(3):
         for k in range(2):
             a = x[r, :, k]
             pairs = (w[r] * np.abs(a[:, None] - a) * w[r][:, None]).sum()
             exact = (w[r] * np.abs(a - y[r, k])).sum() - pairs / 2
-            assert found[r, k] == pytest.approx(exact, abs=1e-13)
+            assert interval[r, k] == pytest.approx(exact, abs=1e-13)
     equal = np.full(n, 1 / n)
     assert np.allclose(crps(x, y, weights=[equal] * 3), crps(x, y), atol=1e-13)
 
@@ -109,10 +109,10 @@ def test_crps_is_its_definition(n):
 @pytest.mark.parametrize("n", [2, 3, 8, 50, 301])
 def test_intervals_are_those_of_scipy(n, level):
     values = np.random.default_rng(n).standard_normal(n) ** 3
-    found = mean_interval(values, level=level)
+    interval = mean_interval(values, level=level)
     exact = stats.t.interval(level, n - 1, values.mean(), stats.sem(values))
-    assert (found.low, found.high) == pytest.approx(exact, rel=1e-12)
-    assert found.error == pytest.approx(stats.sem(values), rel=1e-12)
+    assert (interval.low, interval.high) == pytest.approx(exact, rel=1e-12)
+    assert interval.error == pytest.approx(stats.sem(values), rel=1e-12)
     for k in sorted({0, 1, n // 3, n - 1, n}):
         ours = proportion_interval(k, n, level=level)
         theirs = stats.binomtest(k, n).proportion_ci(level, method="exact")
@@ -127,14 +127,19 @@ def test_intervals_are_those_of_scipy(n, level):
 
 
 def test_values_that_are_all_alike():
-    found = mean_interval([2.0, 2.0, 2.0])
-    assert (found.estimate, found.low, found.high, found.error) == (2.0, 2.0, 2.0, 0.0)
+    interval = mean_interval([2.0, 2.0, 2.0])
+    assert (interval.estimate, interval.low, interval.high, interval.error) == (
+        2.0,
+        2.0,
+        2.0,
+        0.0,
+    )
 
 
 def test_tiny_levels_keep_the_estimate_inside():
     for k in range(5):
-        found = proportion_interval(k, 4, level=1e-6)
-        assert found.low <= k / 4 <= found.high
+        interval = proportion_interval(k, 4, level=1e-6)
+        assert interval.low <= k / 4 <= interval.high
 
 
 def test_median_interval_error_tends_to_the_standard_error():

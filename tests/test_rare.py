@@ -1,4 +1,4 @@
-"""What is rare but possible: far from the origin, very sharp, of no weight, silent, too many."""
+"""Rare cases: far from the origin, very sharp, without weight, silent, too many."""
 
 from __future__ import annotations
 
@@ -26,17 +26,19 @@ STILL, PLANE = (
 )
 
 
-def test_what_is_heard_may_be_a_million_times_sharper() -> None:
-    own = GaussianMixture([0.99, 0.01], np.zeros((2, 2)), [1e4 * np.eye(2), np.eye(2)])
-    heard = GaussianMixture.gaussian([0.0, 0.0], SHARP)
-    assert PartialFusion(own, heard).component_shapes().dropped == 0
-    alone = fuse_mixtures(
-        GaussianMixture.gaussian([0.0, 0.0], 1e4 * np.eye(2)), heard
+def test_a_received_belief_may_be_a_million_times_sharper() -> None:
+    prior = GaussianMixture(
+        [0.99, 0.01], np.zeros((2, 2)), [1e4 * np.eye(2), np.eye(2)]
+    )
+    received = GaussianMixture.gaussian([0.0, 0.0], SHARP)
+    assert PartialFusion(prior, received).component_shapes().dropped == 0
+    fused = fuse_mixtures(
+        GaussianMixture.gaussian([0.0, 0.0], 1e4 * np.eye(2)), received
     ).cov
-    assert np.allclose([U @ alone @ U, V @ alone @ V], [1e4, 2e-8], rtol=1e-3)
+    assert np.allclose([U @ fused @ U, V @ fused @ V], [1e4, 2e-8], rtol=1e-3)
 
 
-def test_a_first_source_without_weight_is_no_matter() -> None:
+def test_a_first_source_without_weight_has_no_influence() -> None:
     far = np.full(2, 7e6)
     wide = SHARP + 3e-8 * np.outer(V, V)
     means = [far, far + 10 * U, far - 10 * U]
@@ -46,14 +48,14 @@ def test_a_first_source_without_weight_is_no_matter() -> None:
     assert np.abs(mean - far).max() < 1e-3 and np.allclose(cov, other[1], rtol=1e-6)
 
 
-def test_mixands_and_weights_at_their_limits() -> None:
+def test_mixture_components_and_weights_at_their_limits() -> None:
     ghost = GaussianMixture(
         [0.5, 0.3, 0.2, 0.0], [[0.0], [8.0], [9.0], [100.0]], [[[1.0]]] * 4
     )
-    kept = merge_irrelevant(
+    merged = merge_irrelevant(
         ghost, GaussianMixture.gaussian([1.2], [[1.0]]), threshold=3.0
     )
-    assert np.allclose(sorted(kept.means[kept.weights > 0][:, 0]), [0.0, 8.4])
+    assert np.allclose(sorted(merged.means[merged.weights > 0][:, 0]), [0.0, 8.4])
     gated = partial(within_gate, function=lambda x: x, noise=np.eye(1), gate=3.0)
     assert np.isnan(gated(ghost, np.array([100.0])))
     assert (
@@ -97,20 +99,22 @@ def test_maps_of_many_ensembles_tell_members_from_observations() -> None:
     aim = np.arange(4.0)[:, None]
     each = np.stack([affine.fit(y[k], x[k])(y[0, :4], x[0, :4]) for k in range(4)])
     assert np.allclose(s(y[0, :4], x[0, :4]), each, atol=1e-12)
-    got = compose(one, y[:, :4], x[:, :4], aim)
-    assert np.allclose(got[2], compose(one, y[2, :4], x[2, :4], aim[2]), atol=1e-12)
+    composed = compose(one, y[:, :4], x[:, :4], aim)
+    assert np.allclose(
+        composed[2], compose(one, y[2, :4], x[2, :4], aim[2]), atol=1e-12
+    )
     solved = affine.fit_convex(1e-9 * y[0], 1e-9 * x[0], solver="CLARABEL")
     assert np.allclose(solved.gain, one.gain, atol=1e-4)
 
 
 def test_derivatives_far_from_the_origin_and_of_small_things() -> None:
     for size, far in ((1.0, [4e6, 3e6]), (1e-6, [0.0, 0.0])):
-        at = np.array(far) + size * np.array([6.0, 8.0])
+        position = np.array(far) + size * np.array([6.0, 8.0])
         see = Sensor(
             1, lambda x, p=far: np.linalg.norm(x - p, axis=-1, keepdims=True), [[1.0]]
         )
-        want = distance([0, 1], std=1.0, origin=far).jacobian(at)
-        assert np.abs(see.jacobian(at) - want).max() < 1e-4
+        want = distance([0, 1], std=1.0, origin=far).jacobian(position)
+        assert np.abs(see.jacobian(position) - want).max() < 1e-4
     wrong = Sensor(1, lambda x: x[..., :1], [[1.0]], linear=lambda d: np.eye(d)[1:2])
     with pytest.raises(ValueError, match="linear must return the matrix of h"):
         wrong.H(2)

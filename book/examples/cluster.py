@@ -21,7 +21,7 @@ members = PARAMETERS["members"]
 f = EnsembleFilter.exact(model, sensors, graphs.ring(4), members=members)
 
 
-def trial(seed):
+def trial(seed: np.random.SeedSequence) -> list[float]:
     """Run the filter once; return mean squared error and reported variance, m²."""
     rng = np.random.default_rng(seed)
     times = np.arange(1, 11) * 0.5
@@ -32,7 +32,7 @@ def trial(seed):
     return [float(run[name][5:, :, :2].mean()) for name in COLUMNS]
 
 
-def executor(where):
+def executor(where: str) -> Executor | None:
     """Return the executor that runs the trials; None uses this machine's cores."""
     if where == "dask":
         import dask.distributed as dask

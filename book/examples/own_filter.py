@@ -1,17 +1,19 @@
 """A filter family of your own: beliefs on a grid of positions, for walkers on a line."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from distfilt.filters import Filter, SensorState, Summary, prior_moments
+from distfilt import filters
+from distfilt.filters import SensorState, Step, Summary
 
 X = np.linspace(-6, 6, 241)[:, None]  # positions of the cells, in m
 
 
-def normalize(weights):
+def normalize(weights: np.ndarray) -> np.ndarray:
     """Scale weights so that they sum to one over the cells."""
-    return weights / weights.sum(axis=-1, keepdims=True)
+    return np.asarray(weights / weights.sum(axis=-1, keepdims=True))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -20,18 +22,24 @@ class GridState(SensorState):
     belief_field = "probabilities", (..., "A", len(X))
 
 
-class GridFilter(Filter):
-    state_class = GridState
-    unsupported = {"fusion": "grids are not fused", "lag": "a grid keeps no past"}
+class GridFilter(
+    filters.SensorFilter[GridState], filters.SharesObservations[GridState]
+):
+    """Agents with a model and sensors, which can share observations; no fusion, no lag."""
 
-    def initial_state(self, prior, runs, rng):
-        mean, cov = prior_moments(prior, 1)
+    state_class = GridState
+
+    def initial_state(
+        self, prior: Any, runs: tuple[int, ...], rng: Any
+    ) -> dict[str, Any]:
+        mean, cov = filters.prior_moments(prior, 1)
         density = np.exp(-((X.T - mean) ** 2) / (2 * cov))
         shape = (*runs, self.n_agents, len(X))
         return {"probabilities": np.broadcast_to(normalize(density), shape)}
 
-    def next_state(self, step):
-        t, dt = step.state.t, step.dt
+    def next_state(self, step: Step[GridState]) -> GridState:
+        t = step.state.t
+        dt = step.dt
         # Forecast: every cell spreads over the others by the transition density.
         distance = X.T - self.model.step(X, t, dt)
         kernel = np.exp(-(distance**2) / (2 * self.model.Q(t, dt)))
@@ -47,7 +55,7 @@ class GridFilter(Filter):
             belief[..., agents, :] *= np.exp(-squares / 2)
         return step.end(probabilities=normalize(belief))
 
-    def summarize(self, state):
+    def summarize(self, state: GridState) -> Summary:
         mean = state.probabilities @ X
         variance = state.probabilities @ X**2 - mean**2
         return Summary(mean, variance)

@@ -14,7 +14,7 @@ class Track:
     mean: np.ndarray
     cov: np.ndarray
 
-    def pack(self):
+    def pack(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the payload: each number once, so that the ledger counts the radio's load."""
         upper = np.triu_indices(self.mean.size)
         return np.array([self.name]), self.mean, self.cov[upper].astype(np.float32)

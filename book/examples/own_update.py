@@ -25,7 +25,8 @@ def robust_update(
     limit = 3 * np.sqrt(np.diagonal(S, axis1=-2, axis2=-1))[..., None, :]
     perturbation = rng.standard_normal(predicted.shape) @ np.linalg.cholesky(noise).T
     innovation = observed[..., None, :] - predicted - perturbation
-    return ensemble + np.clip(innovation, -limit, limit) @ np.linalg.solve(S, C)
+    increment = np.clip(innovation, -limit, limit) @ np.linalg.solve(S, C)
+    return np.asarray(ensemble + increment)
 
 
 walk = Model(1, lambda x, t, dt: x, lambda t, dt: 0.1 * dt * np.eye(1), units=("m",))

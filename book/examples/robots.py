@@ -12,27 +12,30 @@ from distfilt import filters
 from distfilt.mixtures import target_fusion
 from distfilt.models import constant_velocity
 from distfilt.network import graphs
-from distfilt.sensors import range_bearing
+from distfilt.sensors import Sensor, range_bearing
 
 STD = (0.3, 0.04)  # of range, in m, and bearing, in rad
 RATE = 0.4  # sightings of a robot a second
 END = 120.0
 ROBOTS = 5
+Pose = tuple[float, float, float]
 
 
-def target(t):
+def target(t: Any) -> np.ndarray:
     """Position and velocity of the sixth robot: a wide arc."""
     angle = np.asarray(t) / 40
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([s, 1 - c, c, s], axis=-1) * [20, 20, 0.5, 0.5]
+    c = np.cos(angle)
+    s = np.sin(angle)
+    arc: np.ndarray = np.stack([s, 1 - c, c, s], axis=-1)
+    return arc * [20, 20, 0.5, 0.5]
 
 
-def first_pose(robot):
+def first_pose(robot: int) -> Pose:
     """Where a robot starts: x, y and heading."""
     return 8.0 * robot - 16, -5.0, 0.3 * robot
 
 
-def drive(pose, speed, turn, dt):
+def drive(pose: Pose, speed: float, turn: float, dt: float) -> Pose:
     """The pose after a straight drive, then a turn."""
     x, y, heading = pose
     x = x + dt * speed * np.cos(heading)
@@ -40,13 +43,13 @@ def drive(pose, speed, turn, dt):
     return x, y, heading + dt * turn
 
 
-def sensor_at(pose):
+def sensor_at(pose: Pose) -> Sensor:
     """The range-bearing sensor of a robot at a pose."""
     x, y, heading = pose
-    return range_bearing([0, 1], std=STD, origin=(x, y), heading=heading)
+    return range_bearing((0, 1), std=STD, origin=(x, y), heading=heading)
 
 
-def simulate(path, rng):
+def simulate(path: Path, rng: np.random.Generator) -> None:
     """Write each robot's log: odometry and sightings, of which one in twenty is an outlier."""
     rows = []
     for robot in range(ROBOTS):
@@ -67,7 +70,7 @@ def simulate(path, rng):
     np.savetxt(path, sorted(rows), delimiter=",")
 
 
-def read_log(path):
+def read_log(path: Path) -> Iterator[filters.Observation]:
     """Yield a log's sightings, each by a sensor where the robot's odometry puts it."""
     poses = {robot: first_pose(robot) for robot in range(ROBOTS)}
     rows = np.loadtxt(path, delimiter=",").tolist()
@@ -87,10 +90,11 @@ model = constant_velocity(sigma=0.03)
 truth = dict(zip(model.names, target(times).T, strict=True))
 
 # Outliers are gated; messages are exchanged every ten seconds only.
-team = ([None] * ROBOTS, graphs.ring(ROBOTS))
-options = {"gate_probability": 0.999, "exchange_interval": 10.0}
+sensors = [None] * ROBOTS  # each observation brings its own
+ring = graphs.ring(ROBOTS)
+options: dict[str, Any] = {"gate_probability": 0.999, "exchange_interval": 10.0}
 fuse = partial(target_fusion, target_dim=4)
-families = {
+families: dict[str, Any] = {
     "mixture": filters.MixtureFilter(
         model, sensors, ring, fusion=fuse, target_dim=4, **options
     ),
@@ -99,7 +103,7 @@ families = {
         model, sensors, ring, lag=40, members=100, **options
     ),
     "increment": filters.InformationIncrementFilter(
-        model, *team, target_dim=4, **options
+        model, sensors, ring, target_dim=4, **options
     ),
 }
 print("filter    error/m  NEES/d  rejected  floats")

@@ -1,6 +1,7 @@
 """Seven filters, one loop: six on one network of walkers, one on a swarm's density."""
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +33,7 @@ crowd = first, law.evolve(np.ones(144), times), path.swapaxes(0, 1)
 fuse = partial(target_fusion, target_dim=4)
 intersect = covariance_intersection
 
-problems = {
+problems: dict[str, tuple[Any, Any]] = {
     "ensemble": (filters.EnsembleFilter(walk, sensors, net), walkers),
     "gaussian": (filters.GaussianFilter(walk, sensors, net, fusion=intersect), walkers),
     "particle": (filters.ParticleFilter(walk, sensors, net, members=2000), walkers),

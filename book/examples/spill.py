@@ -12,14 +12,14 @@ from distfilt.sensors import Sensor
 rng = np.random.default_rng(0)
 
 
-def drift(x, t, dt):
+def drift(x: np.ndarray, t: float, dt: float) -> np.ndarray:
     """The current turns the spill about the origin."""
-    return x + dt * np.stack([-x[..., 1], x[..., 0]], axis=-1)
+    return np.asarray(x + dt * np.stack([-x[..., 1], x[..., 0]], axis=-1))
 
 
-def concentration(place, x):
+def concentration(place: np.ndarray, x: np.ndarray) -> np.ndarray:
     """The concentration at a buoy falls with the distance from the spill's centre."""
-    return np.exp(-((x - place) ** 2).sum(-1, keepdims=True) / 8)
+    return np.asarray(np.exp(-((x - place) ** 2).sum(-1, keepdims=True) / 8))
 
 
 names = ("x", "y")

@@ -1,7 +1,8 @@
 """The set-ups of Tables II and III of Grange et al., for the stored studies and for chapter 4.
 
-A trial of these studies is a batch of a few runs, because a filter steps through five runs in
-hardly more time than through one. The columns of a run end in its number within the batch.
+A trial of these studies is a batch of a few runs, because a filter steps through five
+runs in hardly more time than through one. The columns of a run end in its number within
+the batch.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class Setup:
         return partial(setup, self.made[0], **self.made[1]), ()
 
     @property
-    def changed(self) -> bool:
+    def is_changed(self) -> bool:
         """Whether the scenario differs from the book's own."""
         return bool(self.scenario.changes)
 
@@ -133,7 +134,8 @@ def paper_filter(
 ) -> EnsembleFilter:
     """Algorithm 1 of the paper, in principal components (Algorithm 2) or without.
 
-    Without them the update is `enkf_sampled_covariance`, which is the affine map in closed form.
+    Without them the update is `enkf_sampled_covariance`, which is the affine map in
+    closed form.
     """
     options = s.pca if pca else {}
     if noise_factor == 0:
@@ -163,8 +165,8 @@ def noise_free_update(
 ) -> np.ndarray:
     """The update of Algorithm 2 with predictions without noise, a mistake that is shown.
 
-    The members then determine the predictions, and where these are singular a map does not exist;
-    a pseudo-inverse gives the gain that is nearest to it.
+    The members then determine the predictions, and where these are singular a map does
+    not exist; a pseudo-inverse gives the gain that is nearest to it.
     """
     # Members and predictions in their principal components
     d = ensemble.shape[-1]
@@ -361,14 +363,15 @@ def repeat(*scripts: ModuleType) -> None:
     )
     pool = ProcessPoolExecutor(cpu_count())
     for script in scripts:
-        if not script.SETUP.changed:
+        if not script.SETUP.is_changed:
             _REPEATS[script.NAME] = pool.submit(_compare_first_batch, script.NAME)
 
 
 def _compare_first_batch(name: str) -> str:
     """Compare a study's first batch with the stored one; return an error message or ''.
 
-    Where a script has a `part`, which gives some of a trial's numbers, those are compared.
+    Where a script has a `part`, which gives some of a trial's numbers, those are
+    compared.
     """
     script = studies.script(name)
     study = studies.stored(script.PAPER, script.NAME)
@@ -398,7 +401,7 @@ def load_numbers(script: ModuleType) -> StudyNumbers:
 
     Nothing is stored of a scenario that a reader has changed: two trials of it run now.
     """
-    if script.SETUP.changed:
+    if script.SETUP.is_changed:
         trials = studies.run(script.trial, script.seeds[:2], workers=2)
         return StudyNumbers(trials.metrics(script.columns), script.BATCH)
     study = studies.stored(script.PAPER, script.NAME)

@@ -1,7 +1,7 @@
 """A swarm's local density filters: the paper's, its variants, and flooding, on the same agents.
 
-Chapter 10 runs it live, and the stored studies of local filters run it longer: every scheme sees
-the same positions.
+Chapter 10 runs it live, and the stored studies of local filters run it longer: every
+scheme sees the same positions.
 """
 
 from __future__ import annotations
@@ -67,8 +67,9 @@ SCHEMES: dict[str, tuple[Any, dict[str, Any]]] = {
 class Case:
     """A swarm to be filtered: an interpretation of (23), an initial density, and faults.
 
-    `phase` turns the filters' f against the swarm's; of all agents the share `gone` drops out at
-    `gone_at`; `agents` and `cells` scale the study, with as many neighbours for each agent.
+    `phase` turns the filters' f against the swarm's; of all agents the share `gone`
+    drops out at `gone_at`; `agents` and `cells` scale the study, with as many
+    neighbours for each agent.
     """
 
     reading: str = "slowgibbs"

@@ -1,7 +1,7 @@
 """Agents uncertain of their positions track a target: linear, many runs, three ways to cooperate.
 
-An observation is the target's position relative to the agent's, [I 0] t - e plus noise. Each agent
-filters [target; ego], or in the joint filter [target; all egos].
+An observation is the target's position relative to the agent's, [I 0] t - e plus noise.
+Each agent filters [target; ego], or in the joint filter [target; all egos].
 """
 
 from __future__ import annotations
@@ -88,18 +88,18 @@ class Team:
             seen.append((h @ x[:, None, :, None])[..., 0] + errors)
         return np.array(truth), np.array(seen)
 
-    def arrived(self, k: int, runs: int) -> np.ndarray:
+    def arrivals(self, k: int, runs: int) -> np.ndarray:
         """Return whether a message of step k from j reaches i, (runs, i, j)."""
         received = np.zeros((runs, self.size, self.size), dtype=bool)
         lost = (
             False
             if self.faults is None
-            else self.faults.lost_messages(self.graph, k, runs)
+            else self.faults.draw_losses(self.graph, k, runs)
         )
         received[:, self.graph.receivers, self.graph.senders] = ~np.asarray(lost)
         return received
 
-    def filtered(self, way: str, seen: np.ndarray) -> Belief:
+    def run_filters(self, way: str, seen: np.ndarray) -> Belief:
         """Return beliefs about the target after each step, (steps, runs, A, n) and covariances."""
         if way == "joint":
             return self._joint(seen)
@@ -120,7 +120,7 @@ class Team:
                     "news": exchange_increments,
                     "intersection": intersect_beliefs,
                 }[way]
-                mean, cov = exchange(before, after, self.arrived(k, runs), n)
+                mean, cov = exchange(before, after, self.arrivals(k, runs), n)
             beliefs.append((mean[..., :n], cov[..., :n, :n]))
         return np.array([m for m, _ in beliefs]), np.array([p for _, p in beliefs])
 

@@ -1,10 +1,11 @@
 """One network, every filter: all that the studies of chapter 11 share, under one name.
 
-A `Problem` is a model, sensors, a graph, a prior and the times at which agents are silent
-(`_together_problems.py`). A `Cell` is a filter with a rule of exchange; it makes the filter for
-any problem and for any value of its one tuned option (`_together_cells.py`). Filters that the
-library does not have stand in `_together_filters.py` and `_together_mixtures.py`, the one loop that
-runs and scores them in `_together_scoring.py`.
+A `Problem` is a model, sensors, a graph, a prior and the times at which agents are
+silent (`_together_problems.py`). A `Cell` is a filter with a rule of exchange; it makes
+the filter for any problem and for any value of its one tuned option
+(`_together_cells.py`). Filters that the library does not have stand in
+`_together_filters.py` and `_together_mixtures.py`, the one loop that runs and scores
+them in `_together_scoring.py`.
 """
 
 from __future__ import annotations
@@ -113,7 +114,8 @@ MODULES = (
 def program_digest() -> str:
     """Return a digest of the source of these modules, without comments and docstrings.
 
-    The studies store it, so that another filter, cell or problem than the stored one is noticed.
+    The studies store it, so that another filter, cell or problem than the stored one is
+    noticed.
     """
     text = ""
     for module in MODULES:

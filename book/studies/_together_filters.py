@@ -34,8 +34,8 @@ Information = tuple[Array, Array]
 class FloodingMixin:
     """Flood the observations of a time before any agent filters.
 
-    An observation crosses a link at most once in each direction, with the number of the agent
-    that made it, until all agents have all observations.
+    An observation crosses a link at most once in each direction, with the number of the
+    agent that made it, until all agents have all observations.
     """
 
     def next_state(self, step: Any) -> Any:
@@ -163,10 +163,10 @@ class MeasurementConsensus(GaussianFilter):
 class TargetExchangeFilter(GaussianFilter):
     """Agents filter [target; own position] and exchange beliefs of the target's components.
 
-    With `send_increments` an agent sends the information increment of its observation, as two
-    observations of unit noise; without, its whole belief of the target, and all beliefs are fused
-    with equal weights. The same as an `InformationIncrementFilter`, and as a `MixtureFilter` of
-    one component, for many runs at once.
+    With `send_increments` an agent sends the information increment of its observation,
+    as two observations of unit noise; without, its whole belief of the target, and all
+    beliefs are fused with equal weights. The same as an `InformationIncrementFilter`,
+    and as a `MixtureFilter` of one component, for many runs at once.
     """
 
     _: KW_ONLY
@@ -175,7 +175,7 @@ class TargetExchangeFilter(GaussianFilter):
     share_observations: bool = False
 
     def next_state(self, step: Any) -> Any:
-        """Forecast, update with the own observation, exchange, add what was received."""
+        """Forecast, update with the own observation, exchange, add the received information."""
         n = self.target_dim
         m, P = self._forecast_moments(step)
         before = target_information(m, P, n)
@@ -246,7 +246,8 @@ def upper_triangle(belief: Information) -> Array:
 def pack_increment(before: Information, after: Information, rank: int = 2) -> Array:
     """Return an information increment as `rank` observations of unit noise.
 
-    The increment is J+ - J = HᵀH with H upper triangular, of which the zeros are not sent.
+    The increment is J+ - J = HᵀH with H upper triangular, of which the zeros are not
+    sent.
     """
     values, axes = np.linalg.eigh(after[0] - before[0])
     H = np.sqrt(values[..., -rank:, None]) * axes[..., -rank:].mT
@@ -275,7 +276,7 @@ def unpack_information(
 
 
 class SharedPlanFilter(filters.TransportFilter):
-    """A transport filter that solves one plan where all agents have the same members and weights."""
+    """A transport filter that solves one plan where all agents hold the same members."""
 
     def _transport(self, stack: Any, logs: Array, step: Any) -> Any:
         """Return the coupling of the first agent, for all."""
@@ -301,8 +302,9 @@ class SharedPlanFilter(filters.TransportFilter):
 class LikelihoodConsensus(ParticleFilter):
     """Agents hold the same particles and agree on polynomials that approximate log-likelihoods.
 
-    All draw from one seed. Each agent fits its own log-likelihood by polynomials that are
-    orthonormal on the common particles, and the coefficients are averaged over the network.
+    All draw from one seed. Each agent fits its own log-likelihood by polynomials that
+    are orthonormal on the common particles, and the coefficients are averaged over the
+    network.
     """
 
     _: KW_ONLY
@@ -352,7 +354,7 @@ class LikelihoodConsensus(ParticleFilter):
 
 
 def orthonormal_polynomials(x: Array, degree: int) -> Array:
-    """Return polynomials up to a degree, orthonormal on points (..., N, k), without the constant."""
+    """Return polynomials orthonormal on points (..., N, k), without the constant."""
     u = (x - x.mean(axis=-2, keepdims=True)) / x.std(axis=-2, keepdims=True)
     dims = x.shape[-1]
     exponents = [p for p in np.ndindex(*[degree + 1] * dims) if sum(p) <= degree]
@@ -385,9 +387,9 @@ class GridFilter(
 ):
     """Beliefs on the cells of a square, exact but for the cells' size; for models in the plane.
 
-    Errors of observations are independent of each other. A fusion rule takes vectors: the agents'
-    log-beliefs, whose average is the geometric mean, or with `likelihoods` the log-likelihoods of
-    their observations, whose average is then multiplied by A.
+    Errors of observations are independent of each other. A fusion rule takes vectors:
+    the agents' log-beliefs, whose average is the geometric mean, or with `likelihoods`
+    the log-likelihoods of their observations, whose average is then multiplied by A.
     """
 
     _: KW_ONLY

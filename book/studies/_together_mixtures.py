@@ -1,8 +1,8 @@
 """Gaussian mixtures of many runs at once: partial-state fusion of chapter 7, rules C1 to C3.
 
-A `MixtureFilter` of the library follows one run. `BatchedMixtures` does the same for all runs,
-with arrays (*runs, agents, components, ...) in which a component of weight zero fills an empty
-place; chapter 11 checks that both agree.
+A `MixtureFilter` of the library follows one run. `BatchedMixtures` does the same for
+all runs, with arrays (*runs, agents, components, ...) in which a component of weight
+zero fills an empty place; chapter 11 checks that both agree.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ class BatchedMixtures(
 ):
     """Agents hold mixtures over [target; own position] and send the target's marginal.
 
-    There are at most `n_components`, no fewer than three. A single component is split in three
-    where the transition stretches it by more than `split_threshold`. Received mixtures are fused
-    by `rule`, and all covariances are inflated afterwards.
+    There are at most `n_components`, no fewer than three. A single component is split
+    in three where the transition stretches it by more than `split_threshold`. Received
+    mixtures are fused by `rule`, and all covariances are inflated afterwards.
     """
 
     _: KW_ONLY
@@ -243,7 +243,7 @@ def log_weights(w: Array) -> Array:
 
 
 def normalize_logs(logs: Array, smallest: float = 0.0) -> Array:
-    """Return weights that sum to one from their logarithms; weights up to `smallest` become zero."""
+    """Return weights that sum to one; weights up to `smallest` become zero."""
     w = np.exp(logs - logs.max(axis=-1, keepdims=True))
     w = w / w.sum(axis=-1, keepdims=True)
     w = np.where(w > smallest, w, 0.0)
@@ -358,13 +358,13 @@ def merge_costs(w: Array, m: Array, P: Array, dets: Array, i: Any, j: Any) -> Ar
     w_j = w[batch, j]
     total = w_i + w_j
     share = np.divide(w_i, total, out=np.full(total.shape, 0.5), where=total > 0)
-    cov = merged_covariance(share, m[batch, i], m[batch, j], P[batch, i], P[batch, j])
+    cov = merge_covariances(share, m[batch, i], m[batch, j], P[batch, i], P[batch, j])
     # 2 B = (w_i + w_j) log|P_ij| - w_i log|P_i| - w_j log|P_j|
     bound = total * np.linalg.slogdet(cov)[1]
     return 0.5 * (bound - w_i * dets[batch, i] - w_j * dets[batch, j])
 
 
-def merged_covariance(
+def merge_covariances(
     share: Array, m_i: Array, m_j: Array, P_i: Array, P_j: Array
 ) -> Array:
     """Return the covariance of two merged components, the first with a share of the weight."""
@@ -403,7 +403,7 @@ def merge(w: Array, m: Array, P: Array, size: int) -> Mixtures:
         i, j = cheapest_pairs(table[rows])
         total = w[rows, i] + w[rows, j]
         share = w[rows, i] / total
-        P[rows, i] = merged_covariance(
+        P[rows, i] = merge_covariances(
             share, m[rows, i], m[rows, j], P[rows, i], P[rows, j]
         )
         m[rows, i] += (1 - share)[:, None] * (m[rows, j] - m[rows, i])

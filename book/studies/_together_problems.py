@@ -1,7 +1,7 @@
 """The problems of chapter 11: model, sensors, graph, prior, and the times of silence.
 
-Four problems are tuned and compared; three more are held out, for the decision tree to be
-tried on. Every number comes from ``data/scenarios/together``.
+Four problems are tuned and compared; three more are held out, for the decision tree to
+be tried on. Every number comes from ``data/scenarios/together``.
 """
 
 from __future__ import annotations
@@ -43,8 +43,9 @@ WALKER = ("x", "y", "u", "v")
 class Problem:
     """A filtering problem, the same for all filters; `scored` names the scored components.
 
-    `silent` marks the agents (T, A) that observe nothing at a time. Where agents are uncertain of
-    their own positions, `local` is the problem of one agent: [target; own position].
+    `silent` marks the agents (T, A) that observe nothing at a time. Where agents are
+    uncertain of their own positions, `local` is the problem of one agent: [target; own
+    position].
     """
 
     name: str

@@ -67,11 +67,11 @@ def results(name: str) -> dict[str, Result]:
     """Return all cells of a problem, the reference first."""
     stored = studies.stored("together", "held" if name in THREE else "every")
     prefix = f"{name}_"
-    cells = stored_cells(stored, prefix)
+    cells = cells_in(stored, prefix)
     return {cell: result(stored, prefix + cell, cell) for cell in cells}
 
 
-def stored_cells(stored: Any, prefix: str) -> list[str]:
+def cells_in(stored: Any, prefix: str) -> list[str]:
     """Return the cells that a study has of a problem."""
     suffix = "_floats"
     columns = [c for c in stored.columns if c.startswith(prefix) and c.endswith(suffix)]
@@ -139,7 +139,7 @@ def count_operations(p: Any, cell: str, members: int | None = None) -> float:
     rule = cell.split("_")[-1]
     d = p.model.dim
     near = float(p.graph.in_degree.mean())
-    m = observed_components(p, rule, near)
+    m = count_observed(p, rule, near)
     transition = 400 if "chaotic" in p.traits else 2 * d * d
     fusing = FUSION_FACTORS.get(rule, 0) * (1 + near) * d**3
     if family in ("ekf", "ukf"):
@@ -165,7 +165,7 @@ def count_operations(p: Any, cell: str, members: int | None = None) -> float:
     return count_ensemble_operations(family, n, d, m, transition) + fusing
 
 
-def observed_components(p: Any, rule: str, near: float) -> float:
+def count_observed(p: Any, rule: str, near: float) -> float:
     """Return how many observed components an agent uses in a step."""
     agents = 1.0
     if rule in SHARING_NEIGHBOURS:
@@ -192,10 +192,10 @@ def count_ensemble_operations(
 # --------------------------------------------------------------------------------- decision tree
 
 QUESTIONS = ("plane", "doubted", "chaotic", "several", "curved", *BUDGETS)
-"""What a user knows of a problem, and whether an agent may send more than a number.
+"""Traits of a problem that a user knows, and budgets that an agent may exceed.
 
-Where two questions divide the four problems alike the first one stands: the dimension comes before
-the curvature.
+Where two questions divide the four problems alike the first one stands: the dimension
+comes before the curvature.
 """
 
 
@@ -255,8 +255,8 @@ def tree(rows: Sequence[Row], depth: int) -> tuple[float, Any]:
         no = tuple(row for row in rows if not answer(question, *row))
         if not yes or not no:
             continue
-        cost_yes, tree_yes = cached_tree(yes, depth - 1)
-        cost_no, tree_no = cached_tree(no, depth - 1)
+        cost_yes, tree_yes = tree_once(yes, depth - 1)
+        cost_no, tree_no = tree_once(no, depth - 1)
         cost = cost_yes + cost_no
         # A question has to be worth a hundredth.
         if cost < least[0] - 0.01:
@@ -265,7 +265,7 @@ def tree(rows: Sequence[Row], depth: int) -> tuple[float, Any]:
 
 
 @cache
-def cached_tree(rows: tuple[Row, ...], depth: int) -> tuple[float, Any]:
+def tree_once(rows: tuple[Row, ...], depth: int) -> tuple[float, Any]:
     """Return `tree`, computed once."""
     return tree(rows, depth)
 

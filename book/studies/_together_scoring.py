@@ -70,10 +70,10 @@ def score_filter(
 ) -> dict[str, Any]:
     """Run a filter on the data; return each run's scores, and the numbers sent a step.
 
-    ``error`` is the mean squared error of the scored components, ``nees`` the NEES per component,
-    ``crps`` their sum of CRPS; all are means over agents and over the times after the burn-in.
-    ``floats`` counts the numbers that an agent sends in a step. With `one_by_one` the filter
-    follows one run at a time.
+    ``error`` is the mean squared error of the scored components, ``nees`` the NEES per
+    component, ``crps`` their sum of CRPS; all are means over agents and over the times
+    after the burn-in. ``floats`` counts the numbers that an agent sends in a step. With
+    `one_by_one` the filter follows one run at a time.
     """
     truth, observed = data
     runs = truth.shape[1]
@@ -121,8 +121,8 @@ def log_scores(
 ) -> Array:
     """Return minus the log-density of the truth, by each run's means and covariances.
 
-    Tuning minimizes it. Means over agents and over the times after the burn-in, of the scored
-    components; infinite where a filter fails or a cloud has no width.
+    Tuning minimizes it. Means over agents and over the times after the burn-in, of the
+    scored components; infinite where a filter fails or a cloud has no width.
     """
     truth, observed = data
     state = f.start(

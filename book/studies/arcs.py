@@ -1,7 +1,7 @@
 """Random pairs of bent beliefs: how often the paper's orderings hold, behind chapter 7's shares.
 
-Each trial draws two agents that see one target from different sides, and fuses by each rule. All
-divergences of one trial are taken on the same points, by importance sampling.
+Each trial draws two agents that see one target from different sides, and fuses by each
+rule. All divergences of one trial are taken on the same points, by importance sampling.
 """
 
 from __future__ import annotations
@@ -49,13 +49,14 @@ def arc(
 ) -> GaussianMixture:
     r"""Return a bent belief about [target; ego], of a well known range and a poor bearing.
 
-    Both are in the plane, four components in all. The agent aims at the origin from a distance R.
-    Mixand k lies at the angle :math:`\theta_k=\theta_0+\sigma_\theta s_k` with :math:`s_k` equally
-    spaced in ± `span`, weighs :math:`\propto e^{-s_k^2/2}`, and has the target at distance R, the
-    ego position moved half as far the other way. Within a mixand the errors are independent along
-    the line of sight (`range_std`) and across it (R, `width` and the spacing of the angles
-    multiplied); the ego position takes half of the error across, and has `ego_std` of its own in
-    both directions.
+    Both are in the plane, four components in all. The agent aims at the origin from a
+    distance R. Mixand k lies at the angle :math:`\theta_k=\theta_0+\sigma_\theta s_k`
+    with :math:`s_k` equally spaced in ± `span`, weighs :math:`\propto e^{-s_k^2/2}`,
+    and has the target at distance R, the ego position moved half as far the other way.
+    Within a component the errors are independent along the line of sight (`range_std`)
+    and across it (R, `width` and the spacing of the angles multiplied); the ego
+    position takes half of the error across, and has `ego_std` of its own in both
+    directions.
     """
     agent = np.asarray(agent)
     r = float(np.hypot(*agent))

@@ -1,8 +1,9 @@
 """The paper's pendulum under other choices: release angle, pretended noise, the reading of (12).
 
-The runs are the first of the study `starts`. From both of its starts measurement augmentation runs
-with four deviations of the pretended reading, and projection with the two readings of (12) that
-move members towards the constraint. OTF also runs from 30° in place of 60°.
+The runs are the first of the study `starts`. From both of its starts measurement
+augmentation runs with four deviations of the pretended observation, and projection with
+the two interpretations of (12) that move members towards the constraint. OTF also runs
+from 30° in place of 60°.
 """
 
 from __future__ import annotations

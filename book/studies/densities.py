@@ -1,8 +1,8 @@
 """Centralised density filters of Zheng and Lin beside a kernel estimate, open loops and a bound.
 
-One trial runs both readings of (23), from a uniform and from a peaked density, with the exact model
-and with one whose f is out of phase, and averages L2 errors from 20 s on. All filters of a case see
-the same agents.
+One trial runs both interpretations of (23), from a uniform and from a peaked density,
+with the exact model and with one whose f is out of phase, and averages L2 errors from
+20 s on. All filters of a case see the same agents.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ def first_agents(start: str, agents: int, rng: np.random.Generator) -> np.ndarra
 def estimate_from_positions(basis: np.ndarray, positions: np.ndarray) -> Any:
     """Return the linear Bayes estimate of a density from agents alone, a filter of one row.
 
-    A histogram of N independent agents has the variance p / (N cell): first with p = 1, then with
-    that estimate.
+    A histogram of N independent agents has the variance p / (N cell): first with p = 1,
+    then with that estimate.
     """
     cells = grid()
     level = np.ones(grid().size)

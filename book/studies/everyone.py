@@ -1,6 +1,6 @@
 """All hundred local filters of Zheng and Lin's swarm over the long run, not eight of them.
 
-Slow reading of (23), uniform start, 60 s: the paper's gains, and flooding.
+Slow interpretation of (23), uniform start, 60 s: the paper's gains, and flooding.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Fig. 1 of Grange et al.: the paper's filter with and without principal components, 100 runs.
 
-With the 200 members of the figure, all agents at all steps; and with 13, for the claim about small
-samples in Section V.B.
+With the 200 members of the figure, all agents at all steps; and with 13, for the claim
+about small samples in Section V.B.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Fig. 2 of Grange et al.: five agents with principal components, 100 runs, at every step.
 
-With the gain of the scenario, and without any pull: the difference is the effect of consensus.
+With the gain of the scenario, and without any pull: the difference is the effect of
+consensus.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Fig. 2 of Grange et al. with other gains, on the data and draws of `figure_2.py`.
 
-The paper prints no gain, so the claim of Fig. 2 is judged with several, on the first 36 of its 100
-runs. Only the settled errors are stored.
+The paper prints no gain, so the claim of Fig. 2 is judged with several, on the first 36
+of its 100 runs. Only the settled errors are stored.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Interpretations of the consensus of Zheng and Lin, and Fig. 1 under each of them.
 
-Gains per second or per step, a larger integral gain, where consensus starts, R as printed with a
-prior whose mass may change, and the widths that the paper does not give: of the flat Gaussian and
-of the kernel. Slow interpretation of (23), uniform start, 60 s.
+Gains per second or per step, a larger integral gain, where consensus starts, R as
+printed with a prior whose mass may change, and the widths that the paper does not give:
+of the flat Gaussian and of the kernel. Slow interpretation of (23), uniform start, 60
+s.
 """
 
 from __future__ import annotations

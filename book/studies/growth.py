@@ -1,8 +1,9 @@
 """Density filters of swarms of 50 to 10 000 agents, and on coarser and finer grids.
 
-The slow reading of (23), peaked start, three runs. Sixteen local filters; kernels narrow with the
-power that is best, and the radio's range keeps the number of neighbours. Flooding up to 3000
-agents, where everybody's table takes 200 MB; at 10 000 it would be eleven times that.
+The slow interpretation of (23), peaked start, three runs. Sixteen local filters;
+kernels narrow with the power that is best, and the radio's range keeps the number of
+neighbours. Flooding up to 3000 agents, where the agents' tables take 200 MB; at 10 000
+it would be eleven times that.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Does an agent that floods know a swarm better than the observer who sees everybody?
+"""Does an agent that floods know a swarm better than the observer who sees all agents?
 
-Slow reading of (23), peaked start, 15 s, 36 swarms: the observer from the kernel estimate and
-from the flat Gaussian, and local filters by flooding. Errors are L2, averaged from 10 s on.
+Slow interpretation of (23), peaked start, 15 s, 36 swarms: the observer from the kernel
+estimate and from the flat Gaussian, and local filters by flooding. Errors are L2,
+averaged from 10 s on.
 """
 
 from __future__ import annotations

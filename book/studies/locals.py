@@ -1,7 +1,7 @@
 """Fig. 1 of Zheng and Lin, six runs: local filters with the paper's gains, and flooding.
 
-The slow reading of (23), uniform start, 60 s. One trial is one run of all filters on the same
-agents; errors are L2, averaged over time.
+The slow interpretation of (23), uniform start, 60 s. One trial is one run of all
+filters on the same agents; errors are L2, averaged over time.
 """
 
 from __future__ import annotations

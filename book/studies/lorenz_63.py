@@ -1,7 +1,8 @@
 """Lorenz-63 with three maps and three sizes of ensemble: the study behind chapter 3's comparison.
 
-All three components are observed through noise of variance 4, every 0.1 units of time. Each trial
-has one truth, one series of observations and one set of first members for all filters.
+All three components are observed through noise of variance 4, every 0.1 units of time.
+Each trial has one truth, one series of observations and one set of first members for
+all filters.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Lorenz-63 with one component seen: transport, Kalman and particle filters, and a reference.
 
-Every family runs with three strengths of its own remedy for a spread that is too small. The first
-`TUNING` trials choose the strength, the others are reported. The reference, ``bound`` in the names
-of the columns, is a particle filter with `PARTICLES` members on the same data.
+Every family runs with three strengths of its own remedy for a spread that is too small.
+The first `TUNING` trials choose the strength, the others are reported. The reference,
+``bound`` in the names of the columns, is a particle filter with `PARTICLES` members on
+the same data.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ model = lorenz63(step=0.03)
 
 
 def draw_data(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A truth (T, 3), its readings (T, 1), and members of the prior (PARTICLES, 3)."""
+    """A truth (T, 3), its observations (T, 1), and members of the prior (PARTICLES, 3)."""
     start = rng.standard_normal(3) + [1.5, -1.5, 25.5]
     path = simulate(model, start, DT * np.arange(1, STEPS + 101), rng=rng)
     truth = path[100:]

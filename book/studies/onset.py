@@ -1,9 +1,10 @@
 """When does the filter that ignores the constraint leave the pendulum? Figs. 3 and 4, swept.
 
-The runs are the first of the study `starts`. From both of its starts OTF runs with the equations as
-printed, whose extension off the circle is unstable, and with the multiplier's form, which is the
-null: the same motion on the circle, the same members and readings. From the circle OTF and OTNLeqMA
-run with wider priors too, since the paper prints none.
+The runs are the first of the study `starts`. From both of its starts OTF runs with the
+equations as printed, whose extension off the circle is unstable, and with the
+multiplier's form, which is the null: the same motion on the circle, the same members
+and readings. From the circle OTF and OTNLeqMA run with wider priors too, since the
+paper prints none.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Satellites estimate a target and themselves: the study behind chapter 8.
 
-A trial draws truths and observations, and runs every filter on them. Epochs are the paper's, 2 to
-10 h and 20 to 24 h; each epoch's observations are followed by one exchange. Five scenes: the
-paper's two agents; the late one, in which beliefs bend; three and five agents; and three
-variations of the choices that the paper leaves open.
+A trial draws truths and observations, and runs every filter on them. Epochs are the
+paper's, 2 to 10 h and 20 to 24 h; each epoch's observations are followed by one
+exchange. Five scenes: the paper's two agents; the late one, in which beliefs bend;
+three and five agents; and three variations of the choices that the paper leaves open.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Choices that the paper leaves open in orbit, swept: do the claims of Figs. 4 to 6 need them?
 
-The rule for weights and its terms, how many mixands an agent keeps, from which length a mixand is
-split, and whether the reading of 22 h has one error or one for each agent. The draws are those of
-the study `orbit`. The null of Fig. 4, beliefs that are added as if they were independent, is a row
-too.
+The rule for weights and its terms, how many components an agent keeps, from which
+length a component is split, and whether the reading of 22 h has one error or one for
+each agent. The draws are those of the study `orbit`. The null of Fig. 4, beliefs that
+are added as if they were independent, is a row too.
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
 """Search for a pair of beliefs that gives Table 1, and the distance that remains.
 
-An arc of six mixands has five numbers besides its place, and turning or scaling both beliefs
-changes no divergence: twelve numbers are free. Each trial starts somewhere, "far" from anywhere
-within wide bounds or "near" the pair of the scenario with each number changed at random, and goes
-on by evolution with covariance adaptation: it lowers a norm of the nine logarithms of ours over
-printed. All divergences of a search are by importance sampling on the same places of the unit
-cube, so that two pairs can be compared. The result is scored on those places, on fresh ones, on
-many, and by quadrature.
+An arc of six components has five numbers besides its place, and turning or scaling both
+beliefs changes no divergence: twelve numbers are free. Each trial starts somewhere,
+"far" from anywhere within wide bounds or "near" the pair of the scenario with each
+number changed at random, and goes on by evolution with covariance adaptation: it lowers
+a norm of the nine logarithms of ours over printed. All divergences of a search are by
+importance sampling on the same places of the unit cube, so that two pairs can be
+compared. The result is scored on those places, on fresh ones, on many, and by
+quadrature.
 """
 
 from __future__ import annotations

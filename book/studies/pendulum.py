@@ -1,8 +1,9 @@
 """The five algorithms of Das and Bhattacharya on their pendulum, and retraction: Figs. 3 to 5.
 
-A trial is one run: a true swing, its readings and one first ensemble for all algorithms. OTProj
-reports a projection of OTF's members and goes on without it, so it needs no run of its own.
-Retraction runs three times: as it is, with rejuvenation, and with the second-order correction.
+A trial is one run: a true swing, its observations and one first ensemble for all
+algorithms. OTProj reports a projection of OTF's members and goes on without it, so it
+needs no run of its own. Retraction runs three times: as it is, with rejuvenation, and
+with the second-order correction.
 """
 
 # ruff: noqa: SIM300
@@ -32,7 +33,7 @@ TIMES = DT * np.arange(1, STEPS + 1)
 NOISE = setting["noise_variance"] * np.eye(2)
 MOTION = ([0, 1], [2, 3])
 TRACED = tuple(range(STEPS // 20))
-"""Spans of twenty readings over which the constraint error is averaged for the figure."""
+"""Spans of twenty observations over which the constraint error is averaged for the figure."""
 REJUVENATION = 0.2
 """Bandwidth of rejuvenation; the paper's algorithms draw nothing."""
 

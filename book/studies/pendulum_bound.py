@@ -1,10 +1,11 @@
 """How well can the pendulum be known? Cartesian filters, filters in the chart, and a bound.
 
-Three cases. ``still`` has no process noise, as in the paper; ``noisy`` has some; in ``mirror`` the
-sensor sees only \\|x\\|, so that the posterior has two modes for ever. All ensembles start on the
-manifold. True swings start from draws of the prior that every filter is given, so that the
-posterior's mean is the best estimate on average: the bound. That of ``still`` is a grid of initial
-conditions, that of the others particles in the chart.
+Three cases. ``still`` has no process noise, as in the paper; ``noisy`` has some; in
+``mirror`` the sensor sees only \\|x\\|, so that the posterior has two modes for ever.
+All ensembles start on the manifold. True swings start from draws of the prior that
+every filter is given, so that the posterior's mean is the best estimate on average: the
+bound. That of ``still`` is a grid of initial conditions, that of the others particles
+in the chart.
 """
 
 # ruff: noqa: SIM300
@@ -92,7 +93,7 @@ def to_cartesian(q: np.ndarray) -> np.ndarray:
 
 
 def data(rng: np.random.Generator, noisy: bool, prior=PRIOR) -> tuple[np.ndarray, ...]:
-    """True chart states (T, 2) from a draw of the prior, readings (T, 2), the prior's centre."""
+    """Draw true chart states (T, 2) and observations (T, 2); return the prior's mean too."""
     centre, std = prior
     state = centre + std * rng.standard_normal(2)
     truth = np.empty((STEPS, 2))
@@ -106,7 +107,7 @@ def data(rng: np.random.Generator, noisy: bool, prior=PRIOR) -> tuple[np.ndarray
 
 
 def simulate_many(seeds) -> tuple[np.ndarray, np.ndarray]:
-    """The noisy case of many runs at once: true chart states (T, R, 2) and readings (T, R, 2)."""
+    """Draw many runs of the noisy case: true chart states and observations, (T, R, 2)."""
     drawn = []
     for seed in seeds:
         rng = np.random.default_rng(seed)

@@ -1,8 +1,8 @@
 """Other interpretations of the set-up of Fig. 1 of Grange et al.
 
-The truth moves without process noise, as Section V.B can be read; the predicted observations carry
-no noise or a hundredth of the stated; the orbital rate is the printed one or that of the printed
-orbit.
+The truth moves without process noise, as Section V.B can be read; the predicted
+observations carry no noise or a hundredth of the stated; the orbital rate is the
+printed one or that of the printed orbit.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""Random pairs with many mixands: how often Table 2's orderings hold, for chapter 7's shares.
+"""Random pairs with many components: how often Table 2's orderings hold, for chapter 7's shares.
 
-Pairs are drawn as in the study of the rules for weights, with seven to nine mixands each, and
-reduced before or after the product to the sizes that the relevance rule leaves: for a factor of
-(41) that merges much, and for the milder one of our Table 2. All divergences of one trial are
-taken on points of the same seeds, by importance sampling.
+Pairs are drawn as in the study of the rules for weights, with seven to nine components
+each, and reduced before or after the product to the sizes that the relevance rule
+leaves: for a factor of (41) that merges much, and for the milder one of our Table 2.
+All divergences of one trial are taken on points of the same seeds, by importance
+sampling.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ parameters = {
 seeds = np.random.SeedSequence(20261).spawn(200)
 rtol = 1e-3
 atol = 1e-9
-# Which of nearly equal shapes least squares keep hangs on the last bit, and so does a divergence
+# Which of nearly equal shapes least squares keep depends on the last bit, and so does a divergence
 # that a thin tail decides: in one trial of eight some number with the mild factor, whose many
 # shapes are nearly equal, is another one with another order of the sums. Medians and shares stay.
 ill_conditioned = [

@@ -1,16 +1,17 @@
 """Bayes estimates for Table II of Grange et al., by a Rao-Blackwellised particle filter.
 
-Only the angle is not linear, and the motion along the orbit's normal does not couple to the rest.
-So particles hold (z, vz), drawn given the velocity that is read; each carries a Gaussian of the
-plane (x, y, vx, vy) of its own, which takes positions and velocities as a Kalman filter does, and
-the angle's likelihood of y by quadrature. All particles share the plane's covariance, the mean of
-theirs: that is all that is approximated. Two filters run with draws of their own; half the
-distance of their means tells how much chance is left.
+Only the angle is not linear, and the motion along the orbit's normal does not couple to
+the rest. So particles hold (z, vz), drawn given the velocity that is read; each carries
+a Gaussian of the plane (x, y, vx, vy) of its own, which takes positions and velocities
+as a Kalman filter does, and the angle's likelihood of y by quadrature. All particles
+share the plane's covariance, the mean of theirs: that is all that is approximated. Two
+filters run with draws of their own; half the distance of their means tells how much
+chance is left.
 
-On the data of Fig. 1 this is a reference: there every truth starts at one state, which no belief
-knows. Where truths are drawn from the prior no estimate has a smaller mean squared error: a bound.
-The repaired filter runs on these truths as well, and the iterated extended filter, damped, on those
-of Fig. 1.
+On the data of Fig. 1 this is a reference: there every truth starts at one state, which
+no belief knows. Where truths are drawn from the prior no estimate has a smaller mean
+squared error: a bound. The repaired filter runs on these truths as well, and the
+iterated extended filter, damped, on those of Fig. 1.
 """
 
 from __future__ import annotations
@@ -262,7 +263,7 @@ def simulate_from_prior(
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """A batch of runs on the data of Fig. 1, and one whose truths are drawn from the prior."""
-    if not APPLIES:  # a reader's sensors: there is no such split of the readings
+    if not APPLIES:  # a reader's sensors: there is no such split of the observations
         return dict.fromkeys(columns, float("nan"))
     for_data, _ = seed.spawn(2)
     for_particles, for_prior, for_filters = seed.spawn(3)

@@ -1,8 +1,9 @@
 """Eight agents on a ring lose three messages in ten; which rule loses the target?
 
-A trial is a batch of runs. The agents observe the target's position relative to their own, or its
-range and bearing from circles of two sizes. Agents are uncertain of their own positions, and the
-target has process noise, so that information increments are not exact (`_team.py`).
+A trial is a batch of runs. The agents observe the target's position relative to their
+own, or its range and bearing from circles of two sizes. Agents are uncertain of their
+own positions, and the target has process noise, so that information increments are not
+exact (`_team.py`).
 """
 
 from __future__ import annotations
@@ -148,7 +149,7 @@ def run_converted(case: team.Team, seen: np.ndarray, radius: float) -> team.Beli
     for k, y in enumerate(seen):
         mean = mean @ move.T
         cov = move @ cov @ move.T + noise
-        received = case.arrived(k, RUNS) | np.eye(AGENTS, dtype=bool)
+        received = case.arrivals(k, RUNS) | np.eye(AGENTS, dtype=bool)
         for j in range(AGENTS):
             # Range r and unit vector u give the relative position r u.
             far = y[:, j, 0]
@@ -183,7 +184,7 @@ def run_single(
         mean, cov = condition(*before, gap, eye.jacobian(before[0]), eye.noise_cov)
         if exchange:
             mean, cov = team.exchange_increments(
-                before, (mean, cov), case.arrived(k, RUNS), 4
+                before, (mean, cov), case.arrivals(k, RUNS), 4
             )
             cov = 0.5 * (cov + cov.mT)
         beliefs.append((mean[..., :4], cov[..., :4, :4]))
@@ -197,7 +198,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     truth, seen = case.data(STEPS, RUNS, rng)
     metrics: dict[str, float] = {}
     for way in WAYS:
-        metrics |= score_beliefs(truth, case.filtered(way, seen), way)
+        metrics |= score_beliefs(truth, case.run_filters(way, seen), way)
     for radius in RADII:
         truth, seen = simulate_sightings(rng, radius)
         beliefs = (

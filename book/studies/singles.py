@@ -1,7 +1,8 @@
 """Single Gaussians on the paper's orbit, many seeds: fusion against the joint filter.
 
-The draws are those of the study `orbit`, whose 48 seeds are the first of these. The unscented rows
-are the same filters with unscented points in place of second-order differences.
+The draws are those of the study `orbit`, whose 48 seeds are the first of these. The
+unscented rows are the same filters with unscented points in place of second-order
+differences.
 """
 
 from __future__ import annotations

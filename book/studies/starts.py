@@ -1,9 +1,10 @@
 """The paper's pendulum from two starts: members off the circle, and members on it.
 
-Section 5 of Das and Bhattacharya draws members that meet the constraint; Section 6 says only that
-initial conditions differ. The first start is that of the study `pendulum`. For the second, angle
-and angular rate are drawn, with the prior's deviation for the centre and about it, and every member
-starts on the circle. Both starts of a trial have one true swing and the same readings.
+Section 5 of Das and Bhattacharya draws members that meet the constraint; Section 6 says
+only that initial conditions differ. The first start is that of the study `pendulum`.
+For the second, angle and angular rate are drawn, with the prior's deviation for the
+centre and about it, and every member starts on the circle. Both starts of a trial have
+one true swing and the same readings.
 """
 
 # ruff: noqa: SIM300

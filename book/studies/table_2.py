@@ -1,7 +1,7 @@
 """Better filters for Table II of Grange et al., on the data of Fig. 1, run by run.
 
-The paper's filter as `tuning.py` has tuned it; each repair alone; the best method with three
-seeds of its own; and two central filters that linearize, for comparison.
+The paper's filter as `tuning.py` has tuned it; each repair alone; the best method with
+three seeds of its own; and two central filters that linearize, for comparison.
 """
 
 from __future__ import annotations

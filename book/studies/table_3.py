@@ -1,7 +1,8 @@
 """Better filters for Table III of Grange et al., on the data of Fig. 2, run by run.
 
-The paper's filter as printed and as `tuning.py` has tuned it, each repair alone, the best
-method, and a central multiplicative extended Kalman filter as the near-exact reference.
+The paper's filter as printed and as `tuning.py` has tuned it, each repair alone, the
+best method, and a central multiplicative extended Kalman filter as the near-exact
+reference.
 """
 
 from __future__ import annotations

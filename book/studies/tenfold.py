@@ -1,11 +1,11 @@
 """Figs. 1 and 2 of Zheng and Lin with the printed gains, ten times a and ten times b, six runs.
 
-Consensus starts where the filters start, at the flat Gaussian; slow interpretation of (23), from a
-uniform and from a peaked density. Beside them the nulls: agents that do not communicate
-(``silent``), filters of zero gain from the flat Gaussian (``zero``) and from the first kernel
-estimate (``open``); and filters that start as the local ones and observe all (``central_flat``). All filters of a case share
-one basis, so that all of them cost little more than one; the agents of the uniform case are those
-of `locals`.
+Consensus starts where the filters start, at the flat Gaussian; slow interpretation of
+(23), from a uniform and from a peaked density. Beside them the nulls: agents that do
+not communicate (``silent``), filters of zero gain from the flat Gaussian (``zero``) and
+from the first kernel estimate (``open``); and filters that start as the local ones and
+observe all (``central_flat``). All filters of a case share one basis, so that all of
+them cost little more than one; the agents of the uniform case are those of `locals`.
 """
 
 from __future__ import annotations

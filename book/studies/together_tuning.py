@@ -1,8 +1,9 @@
 """The one tuning budget of chapter 11: five values of one number, for every filter alike.
 
-The runs are not reported. Filters are compared by the mean log score of all scored components,
-which rewards small errors and reported covariances that fit them: no filter gains by being
-overconfident or underconfident. The best values stand in data/scenarios/together/tuned.toml.
+The runs are not reported. Filters are compared by the mean log score of all scored
+components, which rewards small errors and reported covariances that fit them: no filter
+gains by being overconfident or underconfident. The best values stand in
+data/scenarios/together/tuned.toml.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Information increments against shared observations, of a target with process noise.
 
-The stored trial is the orbit of chapter 8 with five agents, noise on all velocities and no
-ephemeris. ``news`` is `InformationIncrementFilter`; in ``joint`` each agent filters
-[target; all agents] with the observations of all; ``intersection`` fuses beliefs of the target.
+The stored trial is the orbit of chapter 8 with five agents, noise on all velocities and
+no ephemeris. ``news`` is `InformationIncrementFilter`; in ``joint`` each agent filters
+[target; all agents] with the observations of all; ``intersection`` fuses beliefs of the
+target.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The truncation of the shared basis, against the dense filter on the paper's own grid.
 
-The slow interpretation of (23), in whose covariance the most waves survive: all filters have the
-same kernel estimates and the same noise, and differ in the number of columns.
+The slow interpretation of (23), in whose covariance the most waves survive: all filters
+have the same kernel estimates and the same noise, and differ in the number of columns.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The paper's filter with every gain, with and without the own mean, with and without PCA.
 
-Run on seeds of its own, so that the comparison of `table_2.py` and `table_3.py` is fair: there the
-paper's filter runs with the best values of this study. All gains run at once, as an axis of runs.
+Run on seeds of its own, so that the comparison of `table_2.py` and `table_3.py` is
+fair: there the paper's filter runs with the best values of this study. All gains run at
+once, as an axis of runs.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Consensus protocols compared, and under faults: losses, dropout, a wrong model.
 
-A peaked start for the table of rules; agents that drop out; and filters whose f is out of phase,
-with and without process noise. Errors over time of the first and the last, for a figure.
+A peaked start for the table of rules; agents that drop out; and filters whose f is out
+of phase, with and without process noise. Errors over time of the first and the last,
+for a figure.
 """
 
 from __future__ import annotations

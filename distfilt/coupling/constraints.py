@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ..ensembles import Ensemble
-from ..linalg import SolverError, evaluate_derivative, central_difference
+from ..linalg import SolverError, central_difference, evaluate_derivative
 from ..validation import (
     Array,
     ArrayInput,
@@ -121,6 +121,7 @@ def norm_constraint(
         return np.asarray((x[..., columns] ** 2).sum(axis=-1, keepdims=True))
 
     def jacobian(x: Array) -> Array:
+        # The derivative of |x_I|² is 2 x_I'.
         slope = np.zeros((*x.shape[:-1], 1, x.shape[-1]))
         slope[..., 0, columns] = 2 * x[..., columns]
         return slope
@@ -262,6 +263,7 @@ def retract(
     x = states.reshape(-1, states.shape[-1]).copy()
     residual = constraint.residual(x)
     active = np.arange(len(x))
+    # Only states that have not converged take part.
     for _ in range(_STEPS):
         slope, error = _relative_residual(constraint, x[active], residual[active])
         unsolved = error > _TOLERANCE
@@ -324,6 +326,7 @@ def _line_search(
 
     Returns the states, their residuals, and whether these have decreased.
     """
+    # Every state has its own step length, a power of one half.
     before = np.linalg.norm(residual, axis=-1)
     decreased = np.zeros(len(x), dtype=bool)
     new_x = x.copy()

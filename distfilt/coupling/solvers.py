@@ -261,6 +261,7 @@ def _solve_entropic(
             f"entropic: marginals off by {error:.3g} after {_NEWTON} Newton steps: "
             f"regularisation {strength:g} needs to be larger, or another solver"
         )
+    # Rows and columns without mass are empty.
     full_matrix = np.zeros(cost.shape)
     full_matrix[np.ix_(rows, columns)] = matrix
     potential = np.zeros(cost.shape[1])
@@ -297,6 +298,7 @@ def _solve_unit_entropy(
         error = float(np.abs(sums - columns).sum())
         if error < tolerance or damping > 1e9:
             break
+        # Hessian diag(T'1) - T' diag(a)⁻¹ T, damped in units of the masses.
         curvature = np.diag(sums + damping * columns)
         hessian = curvature - matrix.T @ (matrix / rows[:, None])
         trial = g - np.linalg.solve(hessian, sums - columns)
@@ -363,6 +365,7 @@ def monotone_plan(
     row_order = np.argsort(source, kind="stable")
     column_order = np.argsort(target, kind="stable")
     row_ranks, column_ranks, mass = _staircase(a[row_order], b[column_order])
+    # From ranks back to the given order.
     i = row_order[row_ranks]
     j = column_order[column_ranks]
     matrix = np.zeros((source.size, target.size))

@@ -194,6 +194,7 @@ def transform_ensemble(
     """
     weights = normalize_weights(log_weights, ensemble.shape[:-1])
     solve = solver_of(solver, regularisation)
+    # X+ = X N T.
     plans = _solve_plans(ensemble, weights, solve)
     transformed = apply_plan(ensemble, weights, plans)
     if debias:
@@ -201,6 +202,7 @@ def transform_ensemble(
         plans = _solve_plans(ensemble, equal, solve)
         # x_j - N sum_i t_ij x_i for equal weights is the solver's own displacement.
         transformed += ensemble - apply_plan(ensemble, equal, plans)
+        # The mean becomes the weighted one again.
         mean = transformed.mean(axis=-2, keepdims=True)
         transformed += weights[..., None, :] @ ensemble - mean
     if not correct:
@@ -280,6 +282,7 @@ def _correct_moments(transformed: Array, ensemble: Array, weights: Array) -> Arr
     product = anomalies @ root
     u, sizes, vt = np.linalg.svd(product, full_matrices=False)
     u = u * (sizes[..., None, :] > _rounding(transformed, product, root, vt.mT, n))
+    # Rounding leaves the directions a small mean.
     u -= u.mean(axis=-2, keepdims=True)
     return np.asarray(mean + np.sqrt(n) * (u @ vt @ root.mT))
 
@@ -496,6 +499,7 @@ def transform_along(
     )
     costs = (tangents * tangents).sum(axis=-1)
     plans = _solve_couplings(costs, weights, solver_of("network"))
+    # v_j = N sum_i t_ij difference(x_i, x_j).
     steps = n * np.einsum("...ij,...ijk->...jk", plans, tangents)
     transformed = call_user(retract, ensemble.copy(), steps)
     return check_array(transformed, "retract", ensemble.shape)

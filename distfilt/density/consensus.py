@@ -80,6 +80,7 @@ def estimate_without_messages(
     """
     if not protocol.reference:
         return snapshot.kernels
+    # Without edges the channel transmits nothing.
     no_edges = np.zeros((0, 2))
     channel = Channel(Graph.from_edges(len(snapshot.positions), no_edges))
     memory = call_user(protocol.initial_state, snapshot)
@@ -92,6 +93,7 @@ def _encode(snapshot: SwarmSnapshot, modes: int | None, densities: Array) -> Arr
     values = densities
     if modes is not None:
         values = densities @ snapshot.grid.cosines(modes) * snapshot.grid.volume
+    # One agent has the input 1, all others 0: its average counts the agents.
     leader = np.arange(len(values)) == np.argmax(snapshot.present)
     return np.concatenate([values, leader[:, None]], axis=1)
 
@@ -152,6 +154,7 @@ class PIConsensus(FrozenModel, ConsensusProtocol):
         """Integrate (16) over `dt`, in as many substeps as stability needs."""
         estimates, integrals, previous = memory
         inputs = _encode(snapshot, self.modes, snapshot.kernels)
+        # The estimates follow the average of the previous inputs.
         state = pi_step(
             PIState(estimates, integrals),
             previous,
@@ -162,6 +165,7 @@ class PIConsensus(FrozenModel, ConsensusProtocol):
             b=self.b,
             rate=(inputs - previous) / dt if self.rate else None,
         )
+        # The memory holds encoded values; the estimates are decoded from them.
         densities, agents = _decode(state.estimate, snapshot, self.modes)
         return (state.estimate, state.integral, inputs), densities, agents
 
@@ -198,12 +202,12 @@ class DynamicAverage(FrozenModel, ConsensusProtocol):
         estimates, previous = memory
         inputs = _encode(snapshot, self.modes, snapshot.kernels)
         graph = channel.graph
-        if graph.directed:
+        if graph.is_directed:
             weights = weighting.doubly_stochastic(graph)
         else:
             weights = weighting.metropolis(graph)
         # A lost message must not change the sum of the estimates.
-        on_loss: LossRule = "keep" if graph.directed else "mutual"
+        on_loss: LossRule = "keep" if graph.is_directed else "mutual"
         # x ← W x + (u - u_previous) conserves mean(x) = mean(u).
         mixed = channel.mix(estimates, weights, on_loss=on_loss)
         estimates = mixed + (inputs - previous)

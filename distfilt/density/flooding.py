@@ -49,9 +49,12 @@ class Flooding(FrozenModel, ConsensusProtocol):
         latest = table.copy()
         agents = np.arange(len(table))
         for i in np.flatnonzero(snapshot.present):
+            # An agent's own table, and those of its neighbours
             tables = np.stack([table[i], *received[i].values()])
+            # For each agent the entry with the latest time.
             newest = tables[..., -1].argmax(axis=0)
             latest[i] = tables[newest, agents]
+        # Half of NEVER separates entries from none.
         oldest = _NEVER / 2 if self.forget is None else snapshot.t - self.forget
         densities, counts = _average_kernels(latest, oldest, snapshot)
         return (latest,), densities, counts
@@ -83,6 +86,7 @@ def _average_kernels(
     counts = recent.sum(axis=1).astype(np.float64)
     if snapshot.local is not None:
         others = np.delete(np.arange(len(recent)), snapshot.local)
+        # The kernels of others are not needed, but their counts are.
         recent[others] = False
     row, agent = np.nonzero(recent)
     # An entry is identified by its agent and its time.
@@ -90,10 +94,13 @@ def _average_kernels(
     _, first, inverse = np.unique(
         entries, axis=0, return_index=True, return_inverse=True
     )
+    # One kernel for each different entry.
     positions = table[row[first], agent[first], :-1]
     z = kernels(positions, snapshot.grid, bandwidth=snapshot.bandwidth)
     weights = np.zeros((len(table), len(positions)))
+    # Row i averages the kernels of the entries in table i.
     weights[row, inverse] = 1.0
+    # A table without entries gives zero.
     totals = np.maximum(weights.sum(axis=1, keepdims=True), 1.0)
     return np.asarray(weights @ z / totals), counts
 
@@ -144,4 +151,5 @@ class Centralised(FrozenModel, ConsensusProtocol):
         positions = snapshot.positions[snapshot.present]
         density = kernel_density(positions, snapshot.grid, bandwidth=snapshot.bandwidth)
         counts = np.full(agents, float(len(positions)))
+        # All agents have the same estimate.
         return (), np.tile(density, (agents, 1)), counts

@@ -123,6 +123,7 @@ class FokkerPlanck(FrozenModel):
     def _faces(self) -> _Faces:
         grid = self.grid
         cells = np.arange(grid.size).reshape(grid.shape)
+        # A face lies between a cell and the next along its axis.
         below = [np.delete(cells, -1, axis=k).ravel() for k in range(grid.dim)]
         above = [np.delete(cells, 0, axis=k).ravel() for k in range(grid.dim)]
         axis = np.repeat(np.arange(grid.dim), [len(cells) for cells in below])
@@ -138,6 +139,7 @@ class FokkerPlanck(FrozenModel):
         across = np.arange(faces.axis.size), faces.axis
         drift = self.swarm.drift_at(faces.points, t)[across]
         diffusion = self.swarm.diffusion_at(faces.points, t)[across]
+        # z = v Δ/D at the face
         peclet = drift * faces.width / diffusion
         # B(-z) = z + B(z): one exponential serves both directions, without cancellation.
         weight = bernoulli(np.abs(peclet))
@@ -161,6 +163,7 @@ class FokkerPlanck(FrozenModel):
         loss = np.bincount(faces.lower, forwards, n)
         loss = loss + np.bincount(faces.upper, backwards, n)
         diagonal = identity - scale * loss
+        # Mass that leaves a cell through a face enters the cell beyond it.
         data = np.concatenate([diagonal, scale * forwards, scale * backwards])
         rows = np.concatenate([np.arange(n), faces.upper, faces.lower])
         columns = np.concatenate([np.arange(n), faces.lower, faces.upper])
@@ -192,6 +195,7 @@ class FokkerPlanck(FrozenModel):
         """Solve (I - θ Δ A(t + Δ)) p' = (I + (1 - θ) Δ A(t)) p by a sparse factorisation."""
         from scipy.sparse.linalg import splu
 
+        # θ = 1 for backward Euler, θ = ½ for Crank-Nicolson
         implicit = dt if self.scheme == "backward_euler" else 0.5 * dt
         right = self._assemble(t, dt - implicit, 1.0)
         matrix = self._assemble(t + dt, -implicit, 1.0)
@@ -204,6 +208,7 @@ class FokkerPlanck(FrozenModel):
         )
 
         def step(p: Array) -> Array:
+            # SuperLU solves for all columns at once; each is one density.
             columns = right @ p.reshape(-1, self.grid.size).T
             solution = factors.solve(np.asfortranarray(columns))
             return np.ascontiguousarray(solution.T).reshape(p.shape)
@@ -217,6 +222,7 @@ class FokkerPlanck(FrozenModel):
         negative.
         """
         grid = self.grid
+        # Backward Euler uses the rates at the end of the step.
         forwards, backwards = self._rates(t + dt)
         factors = []
         for k in range(grid.dim):
@@ -236,6 +242,7 @@ class FokkerPlanck(FrozenModel):
 
     def _rates_across(self, rates: Array, k: int) -> Array:
         """Rates at the faces across axis k, with that axis first, (n_k - 1, ...)."""
+        # Along its axis a grid has one face fewer than cells.
         shape = list(self.grid.shape)
         shape[k] -= 1
         return np.moveaxis(rates[self._faces.axis == k].reshape(shape), k, 0)
@@ -252,6 +259,7 @@ class FokkerPlanck(FrozenModel):
         times : array_like, (T,)
             Strictly increasing from 0, in s.
         """
+        # One step to each time, of any length.
         return trajectory(self.step, values, times, 0.0)
 
 
@@ -272,6 +280,7 @@ def _factorize_tridiagonal(
     reciprocals = 1 / pivots
     lower = forwards * reciprocals[:-1]
     upper = backwards * reciprocals[:-1]
+    # A last axis broadcasts over the densities.
     return lower[..., None], upper[..., None], reciprocals[..., None]
 
 
@@ -281,6 +290,7 @@ def _solve_tridiagonal(
     """Solve in place along the first axis, by forward and backward substitution."""
     for i in range(len(lower)):
         x[i + 1] += lower[i] * x[i]
+    # The last row has no neighbour above.
     x[-1] *= reciprocals[-1]
     for i in range(len(upper) - 1, -1, -1):
         x[i] *= reciprocals[i]

@@ -63,6 +63,7 @@ class Grid(FrozenModel):
                 raise ValueError(
                     f"{name} must have {self.dim} entries, got {corner.size}"
                 )
+            # One number for all axes, or one for each.
             object.__setattr__(self, name, np.broadcast_to(corner, (self.dim,)))
         if (self.width <= 0).any():
             raise ValueError(f"high must be above low = {self.low}, got {self.high}")
@@ -112,6 +113,7 @@ class Grid(FrozenModel):
     @cached_property
     def centres(self) -> Array:
         """Centres of all cells, (n, d)."""
+        # The last axis varies fastest, like the axes of reshaped values.
         middles = [0.5 * (edges[1:] + edges[:-1]) for edges in self.edges]
         coordinates = np.meshgrid(*middles, indexing="ij")
         return np.stack([c.ravel() for c in coordinates], axis=-1)
@@ -155,8 +157,9 @@ class Grid(FrozenModel):
         """Histogram of agents (..., N, d), one or more, as a density (..., n)."""
         agents = positions.shape[-2]
         cells = self.cell_index(positions).reshape(-1, agents)
-        counts = [np.bincount(row, minlength=self.size) for row in cells]
-        counts = np.reshape(counts, (*positions.shape[:-2], self.size))
+        rows = [np.bincount(row, minlength=self.size) for row in cells]
+        counts = np.reshape(rows, (*positions.shape[:-2], self.size))
+        # The mean over a cell is its share of the agents divided by its volume.
         return np.asarray(counts / (agents * self.volume))
 
     @validated
@@ -172,6 +175,7 @@ class Grid(FrozenModel):
         # In units of cells, with the first centre as the origin.
         rows = positions.reshape(-1, self.dim)
         coordinates = ((rows - self.low) / self.spacing - 0.5).T
+        # Outside the outermost centres the nearest value is used: zero slope at walls.
         image = values.reshape(self.shape)
         result = map_coordinates(image, coordinates, order=1, mode="nearest")
         return np.asarray(result.reshape(positions.shape[:-1]))
@@ -210,8 +214,10 @@ class Grid(FrozenModel):
         """
         if rank not in self._cosine_cache:
             x = (self.centres - self.low) / self.width
+            # cos(π k_j (x_j - low_j)/w_j), multiplied over the axes
             phases = np.pi * x[:, None, :] * self.wavenumbers(rank)
             modes = np.cos(phases).prod(axis=-1)
+            # Sums over cells are exact: the norm may be computed by them.
             norms = np.sqrt((modes**2).sum(axis=0) * self.volume)
             modes = np.asarray(modes / norms)
             modes.setflags(write=False)
@@ -265,6 +271,7 @@ def zero_mean_prior(
     ((900, 50), True)
     """
     Bounds(below=grid.size)(rank, "rank")
+    # Beyond a million sides the lowest mode alone remains anyway.
     ell = 0.1 * grid.side if length is None else min(length, 1e6 * grid.side)
     # |k|² of the modes without the constant one
     squares = ((grid.wavenumbers(grid.size)[1:] / grid.width) ** 2).sum(axis=-1)
@@ -276,5 +283,6 @@ def zero_mean_prior(
     basis = np.asarray(grid.cosines(rank + 1)[:, 1:] * scale)
     if mass_std == 0:
         return basis
+    # A constant density of mass mass_std over all cells
     constant = np.full((grid.size, 1), mass_std / (grid.size * grid.volume))
     return np.concatenate([constant, basis], axis=1)

@@ -55,6 +55,7 @@ def check_resolution(grid: Grid, bandwidth: float | Array) -> None:
         )
     least = float(np.min(bandwidth))
     widest = float(grid.spacing.max())
+    # A tolerance of rounding, for grids that are made to fit exactly.
     if widest > 2 * least * (1 + 1e-12):
         raise ValueError(
             f"grid must have cells no wider than two bandwidths, {2 * least:g}, "
@@ -66,6 +67,7 @@ def _factors(positions: Array, grid: Grid, bandwidth: float | Array) -> list[Arr
     """Factors (..., N, n_k) of each agent's kernel, one for each axis."""
     check_resolution(grid, bandwidth)
     grid._check_inside(positions)
+    # One bandwidth for all agents, or one for each.
     h = np.broadcast_to(bandwidth, positions.shape[:-1])
     return [_axis_kernels(positions[..., k], grid, k, h) for k in range(grid.dim)]
 
@@ -205,7 +207,9 @@ def kernel_covariance(
     integral = float(density.sum() * grid.volume)
     if abs(integral - 1) > 1e-8:
         raise ValueError(f"density must have the integral 1, got {integral:g}")
+    # Column j is the kernel of an agent in cell j, as masses of the cells.
     g = kernels(grid.centres, grid, bandwidth=bandwidth).T * grid.volume
+    # E p̂ = G p
     mean = g @ density
     # Second moment of one agent's kernel; the covariance of the mean of N falls as 1/N.
     moment = (g * density) @ g.T / grid.volume
@@ -250,10 +254,12 @@ def bandwidth(
             f"positions must have two agents or more in different places, got {n} "
             f"with a spread of {spread:g}"
         )
+    # No bandwidth may be below half a cell.
     least = 0.5 * float(grid.spacing.max())
     silverman = spread * (4 / ((d + 2) * n)) ** (1 / (d + 4))
     if rule == "silverman":
         return float(max(silverman, least))
+    # From far below Silverman's bandwidth, for clusters, to above it.
     candidates = np.maximum(silverman * np.geomspace(0.15, 1.5, 20), least)
     scores = [_cross_validation_score(positions, grid, h) for h in candidates]
     return float(candidates[int(np.argmin(scores))])

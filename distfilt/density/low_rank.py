@@ -104,6 +104,7 @@ def dense_step(
     # K = P (P + R/Δ)⁻¹, by a solve instead of an inverse
     gain = np.linalg.solve(p + np.diag(variance), p).T
     analysis = mean + gain @ (observed - mean)
+    # (I - K) P, symmetrised below against rounding
     covariance = p - gain @ p
     return Dense.construct(analysis, 0.5 * (covariance + covariance.T))
 
@@ -169,6 +170,7 @@ class LowRank(FrozenModel):
     def estimates(self) -> Array:
         """Every filter's density, (F, n)."""
         # base + S M⁻¹ b
+        # Solved for all filters at once, without an inverse.
         weights = np.linalg.solve(self.information, self.vector[..., None])
         return np.asarray(self.base + (self.basis @ weights)[..., 0])
 
@@ -252,6 +254,7 @@ def low_rank_predict(
         )
     # The data go into the factor L and the estimate, which start anew with M = I and b = 0.
     factors, base = _transition_columns(transition, state.factors, state.estimates)
+    # √Δ L_Q, the same for all filters
     noise = np.broadcast_to(np.sqrt(dt) * process, (len(base), *process.shape))
     forecast = np.concatenate([factors, noise], axis=-1)
     # Right singular vectors of the forecast's factor, by increasing singular value.
@@ -265,6 +268,7 @@ def _transition_columns(
 ) -> tuple[Array, Array]:
     """Apply the transition to columns (..., n, r) and to densities (F, n), in one call."""
     rows = columns.mT
+    # Densities and basis columns are all rows for the transition.
     stacked = np.concatenate([rows.reshape(-1, base.shape[-1]), base])
     result = call_user(transition, stacked)
     filters = len(base)
@@ -304,7 +308,9 @@ def low_rank_step(
     """
     # Δ/R of each cell, zero where nothing is measured
     precision = dt / _noise_strength(noise, state.base.shape)
+    # R⁻¹ Δ (y - base): the innovation of the base, not of the estimate
     innovation = precision * (observed - state.base)
+    # Sᵀ of each row, in a common basis or in one for each filter
     increment = (innovation[:, None, :] @ state.basis)[:, 0]
     information = state.information + _gram_matrices(state.basis, precision)
     # The least eigenvalue is 1 or more: without large entries no matrix is ill-conditioned.

@@ -57,6 +57,7 @@ class SwarmSnapshot(FrozenModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # An agent is absent if all its coordinates are NaN; partly NaN is an error.
         absent = np.isnan(self.positions).all(axis=-1)
         present = self.positions[~absent]
         if np.isnan(present).any() or not len(present):
@@ -73,6 +74,7 @@ class SwarmSnapshot(FrozenModel):
 
     def disk_graph(self, radius: float) -> Graph:
         """Graph of agents within radio range, without links to absent agents."""
+        # Absent agents need any position here; their links are removed afterwards.
         graph = disk(self._fill_absent(self.grid.low), radius)
         return remove_absent(graph, self.present)
 
@@ -90,6 +92,7 @@ class SwarmSnapshot(FrozenModel):
     @property
     def kernels(self) -> Array:
         """Kernel of each agent, zero for absent agents, (A, n)."""
+        # Any position inside the box: the kernel is zeroed below.
         positions = self._fill_absent(self.grid.centres[0])
         z = kernels(positions, self.grid, bandwidth=self.bandwidth)
         return z * self.present[:, None]
@@ -112,6 +115,7 @@ class SwarmSnapshot(FrozenModel):
         """
         if floor is None:
             floor = 0.1 / self.grid.box_volume
+        # Every present agent knows at least itself.
         counts = np.where(self.present, np.maximum(agents, 1.0), 0.0)
         if self.local is not None:
             counts = counts[list(self.local)]
@@ -137,6 +141,7 @@ class SwarmSnapshot(FrozenModel):
         width = 0.3 * self.grid.side if std is None else std
         centre = self._fill_absent(self.grid.low + 0.5 * self.grid.width)
         difference = self.grid.centres - centre[:, None, :]
+        # |c - x|² for each agent and cell
         squares = (difference**2).sum(axis=-1)
         return self.grid.normalize(np.exp(-0.5 * squares / width**2))
 
@@ -152,6 +157,7 @@ def remove_absent(graph: Graph, present: Mask) -> Graph:
     """
     if present.all():
         return graph
+    # Both ends of a link have to be present.
     active = present[graph.receivers] & present[graph.senders]
     pairs = np.stack([graph.receivers[active], graph.senders[active]], axis=1)
     return Graph.from_edges(graph.n_agents, pairs, directed=True)

@@ -7,6 +7,7 @@ A family supplies three methods: `initial_state`, `next_state` and `summarize`. 
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass
@@ -74,7 +75,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
     state, `next_state` makes the next state of a :class:`~distfilt.filters.Step`, and `summarize`
     returns estimates of a state. With `requires_rng` steps draw from a generator; with
     `batched_summary` `summarize` accepts states stacked along a first axis; `belief_kind` names
-    what its fusion rules fuse.
+    the kind of belief that its fusion rules fuse.
     """
 
     _: KW_ONLY
@@ -114,7 +115,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
     def check_parts(self) -> None:
         """Refuse options that do not fit each other; families extend it."""
 
-    # What a family without the option does. A class of `options` makes a field of it.
+    # The behaviour of a family without the option. A class of `options` makes a field of it.
 
     @cached_property
     def fusion(self) -> Any:
@@ -141,11 +142,21 @@ class Filter(FrozenModel, ABC, Generic[S]):
         """How likely a good observation passes the gate; None without a gate."""
         return None
 
-    def is_exchange_time(self, t_before: float, t: float) -> bool:
-        """Whether agents exchange in a step from `t_before` to `t`; in every one by default."""
-        return True
+    @cached_property
+    def exchange_interval(self) -> float | None:
+        """Seconds between two exchanges; None if agents exchange in every step."""
+        return None
 
-    # What a family supplies.
+    def is_exchange_time(self, t_before: float, t: float) -> bool:
+        """Whether a multiple of the interval lies after `t_before` and not after `t`."""
+        if self.exchange_interval is None:
+            return True
+        # To rounding: a sum of steps may fall short of the multiple.
+        tolerance = 1e-9 + 1e-15 * abs(t / self.exchange_interval)
+        number = math.floor(t / self.exchange_interval + tolerance)
+        return number > math.floor(t_before / self.exchange_interval + tolerance)
+
+    # The parts that a family supplies.
 
     @property
     @abstractmethod
@@ -281,7 +292,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         """Take one step from checked arguments."""
         runs = state.failed.shape if isinstance(state, SensorState) else state.runs
         read = self.read_observations(observations, runs, t)
-        matched = match_delayed(self, delayed, state, t) if delayed else ()
+        matched = match_delayed(cast(Any, self), delayed, state, t) if delayed else ()
         step = Step(self, state, t, read, matched, reuse_rng=reuse_rng)
         try:
             return self.next_state(step)
@@ -365,8 +376,8 @@ class Filter(FrozenModel, ABC, Generic[S]):
             Strictly increasing, in s, from the state's on; steps may differ in length. With events
             there is a step at each of their times too, and None is enough if none is delayed.
         observations : sequence of length A, or of Observation
-            Per agent (T, *runs, m) or (T, m), or None; NaN marks what is missing. Or events in any
-            order, several of which may have the same time.
+            Per agent (T, *runs, m) or (T, m), or None; NaN marks a missing component. Or events in
+            any order, several of which may have the same time.
         truth : array_like, (T, *runs, d) or (T, *runs, A, d), or mapping, optional
             If given, the scores are recorded too. The truth is the same for all agents, or each
             agent's own, or it has some components only, by their names, (T, *runs) or
@@ -483,8 +494,8 @@ class SensorFilter(Filter[S]):
         elif not callable(self.graph):
             graph = as_graph(self.graph, self.n_agents, self.names)
             object.__setattr__(self, "graph", graph)
-        interval = getattr(self, "exchange_interval", None)
-        if interval is not None and self.sends_observations and not self.lag:
+        has_interval = self.exchange_interval is not None
+        if has_interval and self.sends_observations and not self.lag:
             raise ValueError(
                 "lag must be at least 1 for observations that wait for an exchange, got 0"
             )
@@ -535,7 +546,7 @@ class SensorFilter(Filter[S]):
             graph = as_graph(graph(t), self.n_agents, self.names)
         if not graph.senders.size:
             return None
-        runs = state.runs
+        runs = state.failed.shape if isinstance(state, SensorState) else state.runs
         return Channel.construct(
             graph, ledger=state.ledger, runs=runs, faults=self.faults, t=t
         )

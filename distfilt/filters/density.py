@@ -108,10 +108,10 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
 
     In each step every agent observes its own position, obtains by the `fusion` protocol an
     estimate y_i of the kernel estimate of all, and assimilates it in a Kalman filter of the density
-    whose model is the Fokker-Planck equation. If the network falls apart, agents go on with what
-    they receive, and the record has the number of parts. The noise of a step's estimate follows
-    from the true number of present agents, which is taken as known: an agent that has received the
-    positions of few is then overconfident.
+    whose model is the Fokker-Planck equation. If the network falls apart, agents go on with the
+    messages they receive, and the record has the number of parts. The noise of a step's estimate
+    follows from the true number of present agents, which is taken as known: an agent that has
+    received the positions of few is then overconfident.
 
     Parameters
     ----------

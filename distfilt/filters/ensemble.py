@@ -1,4 +1,4 @@
-"""Networks of ensemble filters: forecast, assimilate what was received, fuse with the neighbours.
+"""Networks of ensemble filters: forecast, assimilate, fuse with the neighbours.
 
 :class:`EnsembleFilter` is algorithm 1 of Grange et al. for any model, sensors, graph, update and
 fusion rule. The agents of a :class:`TransportFilter` have one set of members in common and agree
@@ -18,7 +18,7 @@ import numpy as np
 from .. import ensembles as moments
 from ..coupling import rejuvenate, transport_plans
 from ..coupling.transform import apply_plan, normalize_weights
-from ..linalg import to_unit_variances
+from ..linalg import center_ensemble, to_unit_variances
 from ..models import Model
 from ..network import Graph, finite_time_consensus, intersect_ensembles
 from ..sensors import Sensor
@@ -131,7 +131,7 @@ class _EnsembleSummary(MembersFilter[EnsembleState]):
     def summarize(self, state: EnsembleState) -> Summary:
         """Return means and variances of the agents' ensembles, and the members for the scores."""
         ensembles = state.ensembles
-        mean, anomalies = moments.center_ensemble(ensembles)
+        mean, anomalies = center_ensemble(ensembles)
         # Σ (xᵢ - m)² / (N - 1), as a mean of N times N / (N - 1).
         anomalies *= anomalies
         variance = moments.mean(anomalies) * (self.members / (self.members - 1))
@@ -189,7 +189,7 @@ class EnsembleFilter(
     forecast: Callable[..., Array] = stochastic_forecast
 
     def check_parts(self) -> None:
-        """Refuse what cannot be called as an update, such as a wrapper without one."""
+        """Refuse an update of another signature, such as a wrapper without its update."""
         super().check_parts()
         try:
             signature(self.update).bind(*range(4), rng=None)
@@ -405,8 +405,8 @@ class TransportFilter(_EnsembleSummary):
         Warns
         -----
         ParticleCollapse
-            If one member has nearly all the weight, or an observation is far beyond what the
-            members predict.
+            If one member has nearly all the weight, or an observation is far beyond the
+            members' predictions.
         """
         state = step.state
         members = state.ensembles
@@ -516,7 +516,7 @@ def regress_past(stack: list[Array], fused: Array) -> list[Array]:
     correlation, unit = to_unit_variances(moments.sample_covariance(present))
     n = present.shape[-2]
     inverse = np.linalg.pinv(correlation, rcond=1e-10, hermitian=True) / (n - 1)
-    _, anomalies = moments.center_ensemble(present)
+    _, anomalies = center_ensemble(present)
     scaled = anomalies / unit[..., None, :]
     shift = (fused - present) / unit[..., None, :]
     # x_past + Δ C⁻¹ Aᵀ x_past / (N - 1)

@@ -1,13 +1,12 @@
 """The exchange between the agents in a step: of observations, and of beliefs by a fusion rule.
 
-:func:`collect_observations` lets the agents share what they observed, and sorts by time what each
-of them has. :func:`fuse_beliefs` applies the filter's fusion rule after the update.
+:func:`collect_observations` lets the agents share their observations, and sorts by time those that
+each of them has. :func:`fuse_beliefs` applies the filter's fusion rule after the update.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,7 +26,7 @@ Known = dict[float, list[list[tuple[Sensor, Array]]]]
 
 
 def collect_observations(step: Step[Any]) -> Known:
-    """Share the step's observations, and sort by time what each agent has then.
+    """Share the step's observations, and sort by time those that each agent has then.
 
     An agent has its own observations and those that its neighbours sent, ordered by sender.
     """
@@ -39,17 +38,22 @@ def collect_observations(step: Step[Any]) -> Known:
     if sent:
         payloads = [_pack(step, of_agent) for of_agent in sent]
         inbox = step.channel.broadcast(payloads)
+    own_labels = [_label(step, of_agent) for of_agent in observed]
     # Receivers know their neighbours' sensors, so only values travel.
-    labels = [_label(step, of_agent) for of_agent in sent or observed]
+    sent_labels = own_labels
+    if step.state.pending:
+        sent_labels = [_label(step, of_agent) for of_agent in sent]
     known: Known = {}
     for agent, messages in enumerate(inbox):
         for sender in sorted((agent, *messages)):
             if sender == agent:
-                times_and_sensors = _label(step, observed[agent])
+                times_and_sensors = own_labels[agent]
                 values = [observation.value for observation in observed[agent]]
             else:
-                times_and_sensors = labels[sender]
-                values = _unpack(messages[sender])
+                times_and_sensors = sent_labels[sender]
+                payload = messages[sender]
+                values = list(payload) if type(payload) is tuple else [payload]
+            # The part behind the values counts as communication alone.
             for (t, sensor), value in zip(times_and_sensors, values, strict=False):
                 if t not in known:
                     known[t] = [[] for _ in observed]
@@ -60,7 +64,7 @@ def collect_observations(step: Step[Any]) -> Known:
 def _choose_outgoing(
     step: Step[Any], observed: list[list[Observation]]
 ) -> list[list[Observation]]:
-    """Choose what each agent sends now: nothing, or what it observed and what was pending.
+    """Choose each agent's messages of this step: nothing, or its new and its pending observations.
 
     Without a channel at this time, the observations wait in ``step.pending`` for the next one.
     """
@@ -107,11 +111,6 @@ def _pack(step: Step[Any], observations: list[Observation]) -> Any:
     return (*[observation.value for observation in observations], labels)
 
 
-def _unpack(payload: Any) -> Sequence[Array]:
-    """Return the values of a payload; the part behind them only counts as communication."""
-    return payload[:-1] if type(payload) is tuple else (payload,)
-
-
 def _label(
     step: Step[Any], observations: list[Observation]
 ) -> list[tuple[float, Sensor]]:
@@ -134,7 +133,8 @@ def fuse_beliefs(step: Step[Any], values: tuple[Array, ...]) -> tuple[Array, ...
     # A failed run's values may make the rule fail again, so those of a good run stand in.
     good = tuple(np.argwhere(~step.failed)[0])
     inputs = [step.keep_failed(v, v[good]).copy() for v in values]
-    run_numbers = np.arange(math.prod(step.runs)).reshape(step.runs)
+    # Any: they stand among the arrays, which are of floats.
+    run_numbers: Any = np.arange(math.prod(step.runs)).reshape(step.runs)
     channel = step.channel
     ledger = channel.ledger
     # The channels of the attempts that went through, each with the same ledger before.

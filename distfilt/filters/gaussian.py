@@ -286,13 +286,13 @@ class GaussianFilter(
             group.predict, group.jacobian, mean, cov, linear
         )
 
-        def predicted_moments(_: Array) -> tuple[Array, Array]:
+        def moments_on_one_branch(_: Array) -> tuple[Array, Array]:
             """Return the moments about one branch, whatever the observed angle is."""
             predict = partial(group.predict, same_branch=True)
             value, h, rest = self._linearize(predict, group.jacobian, mean, cov, linear)
             return value, h @ cov @ h.mT + rest
 
-        group = step.gate(group, predicted_moments, predicted[..., None, :])
+        group = step.gate(group, moments_on_one_branch, predicted[..., None, :])
         noise = np.full((*slope.shape[:-1], slope.shape[-2]), group.noise) + extra
         if joint_mean.shape[-1] > d:
             # Zero slope in the other times' states.

@@ -1,4 +1,4 @@
-"""Localisation and tracking by information increments: what each observation added is sent."""
+"""Localisation and tracking by information increments: agents send the information they gain."""
 
 from __future__ import annotations
 
@@ -81,9 +81,10 @@ class InformationIncrementFilter(TargetMixtureFilter):
     to be discounted. For linear models and Gaussians the result equals one filter of all
     observations if every agent is a neighbour of every other one, nothing is lost, the agents' own
     states are independent given the target's *present* state, and either every increment is sent
-    at once or the target has no process noise: what waits (`exchange_interval`) is counted as if
-    it had none. The origin of observations has to be known: components that all agents receive
-    alike are named in `shared_components`, and each agent assimilates them for itself.
+    at once or the target has no process noise: increments that wait (`exchange_interval`) are
+    counted as if it had none. The origin of observations has to be known: components that all
+    agents receive alike are named in `shared_components`, and each agent assimilates them for
+    itself.
 
     Parameters
     ----------
@@ -108,7 +109,7 @@ class InformationIncrementFilter(TargetMixtureFilter):
     past, which no belief about [target; ego] can hold, and beliefs become overconfident. Then let
     each agent filter [target; all agents] while neighbours share their observations: a
     :class:`GaussianFilter` with one sensor per agent. It sends m numbers an observation, and for
-    linear models it is exact given what an agent has received, with any noise and any losses.
+    linear models it is exact given the observations received, with any noise and any losses.
 
     Examples
     --------
@@ -178,8 +179,9 @@ class InformationIncrementFilter(TargetMixtureFilter):
         unsent: list[GaussianMixture | None] = []
         waiting = step.state.unsent or (None,) * len(beliefs)
         for agent, (old, new) in enumerate(zip(beliefs, after, strict=True)):
-            if waiting[agent] is not None:
-                unsent.append(self._forecast(waiting[agent], agent, step))
+            before: GaussianMixture | None = waiting[agent]
+            if before is not None:
+                unsent.append(self._forecast(before, agent, step))
             else:
                 unsent.append(old if new is not old else None)
         if step.channel is not None:
@@ -235,7 +237,7 @@ class InformationIncrementFilter(TargetMixtureFilter):
                 before = unsent[agent]
                 with step.failing_as(agent):
                     after[agent] = _add_increment(after[agent], increment)
-                    # What is received counts for both, so that it is not sent on.
+                    # A received increment counts for both, so that it is not sent on.
                     if before is not None:
                         unsent[agent] = _add_increment(before, increment)
 

@@ -214,8 +214,8 @@ class MixtureFilter(TargetMixtureFilter, FusesBeliefs[MixtureState]):
     """Every agent holds a mixture over [target; its own state]; only target marginals are sent.
 
     In a step an agent splits the components for which its model is most nonlinear, forecasts all
-    of them, conditions them on its observation, sends its target marginal, fuses what it receives,
-    and merges down to `n_components`. A component that cannot predict an observation (the sensor
+    of them, conditions them on its observation, sends its target marginal, fuses the marginals it
+    receives, and merges down to `n_components`. A component that cannot predict an observation (the sensor
     gives NaN for one of its points) contradicts it and is left out; an observation that
     contradicts all components raises an error.
 

@@ -8,12 +8,11 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..sensors import Sensor
 from ..validation import (
     ALLOW_NAN,
-    Array,
+    ArrayInput,
     FrozenModel,
     InvalidArgumentError,
     NonNegativeInt,
@@ -21,17 +20,8 @@ from ..validation import (
 )
 
 if TYPE_CHECKING:
-    from .base import Filter
+    from .base import SensorFilter
     from .states import State
-
-    class ConvertedArray:
-        """A field that takes whatever numpy converts, and then holds a float64 array."""
-
-        def __get__(self, instance: object, owner: type | None = None) -> Array: ...
-        def __set__(self, instance: object, value: ArrayLike) -> None: ...
-
-else:
-    ConvertedArray = Array
 
 __all__ = [
     "Observation",
@@ -71,14 +61,14 @@ class Observation(FrozenModel):
 
     t: float
     agent: NonNegativeInt
-    value: Annotated[ConvertedArray, "... m", ALLOW_NAN]
+    value: Annotated[ArrayInput, "... m", ALLOW_NAN]
     sensor: NonNegativeInt | Sensor = 0
     _: KW_ONLY
     metadata: tuple[float, ...] = ()
     arrival_time: float | None = None
 
 
-def sensor_of(f: Filter[Any], observation: Observation) -> Sensor:
+def sensor_of(f: SensorFilter[Any], observation: Observation) -> Sensor:
     """Return the sensor of an observation: its own, or one of the agent's."""
     if isinstance(observation.sensor, Sensor):
         return observation.sensor
@@ -92,7 +82,7 @@ def sensor_of(f: Filter[Any], observation: Observation) -> Sensor:
 
 
 def read_observations(
-    f: Filter[Any], observations: Any, runs: tuple[int, ...], t: float
+    f: SensorFilter[Any], observations: Any, runs: tuple[int, ...], t: float
 ) -> list[list[Observation]]:
     """Check the observations of one time, and return a list of them for each agent.
 
@@ -150,7 +140,7 @@ def are_observations(entries: Any) -> bool:
 
 
 def _check_entry(
-    f: Filter[Any], entry: Any, agent: int, t: float, name: str
+    f: SensorFilter[Any], entry: Any, agent: int, t: float, name: str
 ) -> Observation:
     """Return an Observation of this agent and time, or make one of its only sensor's value."""
     if not isinstance(entry, Observation):
@@ -176,7 +166,7 @@ def _check_entry(
 
 
 def _complete(
-    f: Filter[Any], observation: Observation, runs: tuple[int, ...], name: str
+    f: SensorFilter[Any], observation: Observation, runs: tuple[int, ...], name: str
 ) -> Observation | None:
     """Return an observation with a value for each run, or None if all of it is missing."""
     value = observation.value
@@ -193,7 +183,7 @@ def _complete(
 
 
 def match_delayed(
-    f: Filter[Any], delayed: Sequence[Observation], state: State, t: float
+    f: SensorFilter[Any], delayed: Sequence[Observation], state: State, t: float
 ) -> list[Observation]:
     """Match delayed observations to the stored time that each belongs to.
 

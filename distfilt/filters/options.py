@@ -6,7 +6,6 @@ that it offers. The other options are no arguments of its constructor.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -78,15 +77,6 @@ class ExchangesAtIntervals(Filter[S]):
 
     _: KW_ONLY
     exchange_interval: PositiveFloat | None = None
-
-    def is_exchange_time(self, t_before: float, t: float) -> bool:
-        """Whether a multiple of the interval lies after `t_before` and not after `t`."""
-        if self.exchange_interval is None:
-            return True
-        # To rounding: a sum of steps may fall short of the multiple.
-        tolerance = 1e-9 + 1e-15 * abs(t / self.exchange_interval)
-        number = math.floor(t / self.exchange_interval + tolerance)
-        return number > math.floor(t_before / self.exchange_interval + tolerance)
 
 
 @dataclass(frozen=True, eq=False)

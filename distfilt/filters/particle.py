@@ -156,7 +156,7 @@ class ParticleFilter(
     def summarize(self, state: ParticleState) -> Summary:
         """Return weighted moments, effective sizes and the fraction of distinct particles."""
         weights = state.weights
-        mean, cov = weighted_moments(state.particles, weights)
+        mean, cov = compute_moments(state.particles, weights)
         cov = state.mask_failed(cov)
         distinct = particles.distinct_fraction(state.particles)
         numbers = {
@@ -236,7 +236,7 @@ class ParticleFilter(
             is_degenerate = state.effective_size[is_due][:, None] < 2
             equal = 1 / self.members
             weights = np.where(is_degenerate, equal, state.weights[is_due])
-            _, cov = weighted_moments(before[is_due], weights)
+            _, cov = compute_moments(before[is_due], weights)
             is_copied = (counts > 1)[..., None]
             copied = particles.repeat_by_count(is_copied, counts)
             stack[-1][is_due] = particles.add_jitter(
@@ -340,10 +340,10 @@ class ParticleFilter(
 
 
 def _moments_by_logs(predicted: Array, log_weights: Array) -> tuple[Array, Array]:
-    return weighted_moments(predicted, np.exp(log_weights))
+    return compute_moments(predicted, np.exp(log_weights))
 
 
-def weighted_moments(points: Array, weights: Array) -> tuple[Array, Array]:
+def compute_moments(points: Array, weights: Array) -> tuple[Array, Array]:
     """Mean (..., d) and covariance (..., d, d) of points (..., N, d) with weights (..., N)."""
     mean = (weights[..., None, :] @ points)[..., 0, :]
     # Components first, so that the weights multiply along contiguous particles.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..sensors import Sensor
-from ..validation import Array, call_user, check_array, check_increasing
+from ..validation import Array, check_array, check_increasing
 from .observations import Observation, are_observations, list_by_agent
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ def _warn_of_degrees(sensors: Sequence[Sensor], series: Array, agent: int) -> No
         return
     observed = np.nan_to_num(series.astype(np.float64))
     # y - r(y, 0) is the multiple of the period that wrapping takes off.
-    residual = call_user(sensor.residual_function, observed, 0 * observed)
+    residual = sensor.residual(observed, 0 * observed)
     turns = np.abs(observed - residual).max(initial=0.0) / (2 * np.pi)
     if turns > 4:
         warnings.warn(

@@ -67,7 +67,7 @@ def prior_moments(
     dim : int
         Size d of the state.
     definiteness : {"semidefinite", "definite"}
-        What the covariance has to be.
+        The condition that the covariance has to meet.
 
     Examples
     --------

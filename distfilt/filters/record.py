@@ -289,7 +289,7 @@ def _score(
     known_mean = mean[..., components]
     known_truth = truth[..., components]
     is_finite = np.isfinite(known_mean) & np.isfinite(known_truth)
-    is_scored = is_finite.all(axis=-1)
+    is_scored = np.asarray(is_finite.all(axis=-1))
     if "squared_error" in scores:
         squared = (mean - truth) ** 2
         result["squared_error"] = squared

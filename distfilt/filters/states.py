@@ -33,7 +33,7 @@ class State(FrozenModel):
     t : float
         The time, in s.
     ledger : Ledger
-        What has been sent so far.
+        The account of all messages so far.
     rng : numpy.random.Generator or None
         Source of the next draws; None for a filter that draws nothing. A step copies it, so
         that a state can be stepped twice.

@@ -25,7 +25,7 @@ from .observations import Observation
 from .states import SensorState, State
 
 if TYPE_CHECKING:
-    from .base import Filter
+    from .base import Filter, SensorFilter
 
 __all__ = ["Received", "Step", "copy_rng", "group_agents"]
 
@@ -45,7 +45,7 @@ class Step(Generic[S]):
     t, dt : float
         The new time, and the length of the step, in s.
     observations : list of list of Observation
-        What each agent observed now; as ``read_observations`` of the family returned it.
+        Each agent's present observations, as ``read_observations`` of the family returned it.
     delayed : sequence of Observation
         Observations of earlier times that arrive now.
     times : tuple of float
@@ -106,7 +106,8 @@ class Step(Generic[S]):
         *,
         reuse_rng: bool = False,
     ) -> None:
-        self.filter = filter_
+        # Only families with sensors use the parts that need them.
+        self.filter = cast("SensorFilter[Any]", filter_)
         # A family's next_state knows the fields of its own state.
         self.state: Any = state
         self.t = t
@@ -117,11 +118,12 @@ class Step(Generic[S]):
         self.times = state.lagged_times(filter_.lag, t) if has_past else ()
         # Any, since a family that needs a channel has made sure that there is one.
         self.channel: Any = None
-        if filter_.graph is not None:
+        if self.filter.graph is not None:
             self.channel = filter_.channel(state, t)
         # The state is the user's, so its generator is copied; within a run it is the run's own.
-        is_own = reuse_rng or state.rng is None
-        self.rng: Any = state.rng if is_own else copy_rng(state.rng)
+        self.rng: Any = state.rng
+        if state.rng is not None and not reuse_rng:
+            self.rng = copy_rng(state.rng)
         self.failed: Mask = getattr(state, "failed", _NO_RUNS)
         self.runs: tuple[int, ...] = self.failed.shape
         self.any_failed = bool(np.count_nonzero(self.failed))
@@ -186,20 +188,17 @@ class Step(Generic[S]):
         f = self.filter
         if self.delayed or (f.graph is not None and f.share_observations):
             return collect_observations(cast(Step[Any], self))
-        # Every agent has its own present observations and no others.
+        # Nothing is exchanged here. A subclass may have put other agents' observations
+        # into an agent's list, so a sensor is looked up at the agent that observed.
         pairs = []
-        for observations, sensors in zip(
-            self.observations, f.agent_sensors, strict=True
-        ):
-            pairs.append(
-                [
-                    (
-                        sensors[o.sensor] if isinstance(o.sensor, int) else o.sensor,
-                        o.value,
-                    )
-                    for o in observations
-                ]
-            )
+        for observations in self.observations:
+            of_agent = []
+            for o in observations:
+                sensor = o.sensor
+                if isinstance(sensor, int):
+                    sensor = f.agent_sensors[o.agent][sensor]
+                of_agent.append((sensor, o.value))
+            pairs.append(of_agent)
         return {self.t: pairs}
 
     def before(self, place: int, group: Received, past: list[Array]) -> Array | None:
@@ -568,7 +567,7 @@ class Received:
         Returns
         -------
         group : Received
-            With NaN in place of what is rejected.
+            With NaN in place of the rejected observations.
         rejected : ndarray, (*runs, G)
             How many observations of each agent are rejected.
         """

@@ -152,8 +152,8 @@ def _fill_absent(value: Array, present: Mask, axes: int, name: str) -> Array:
 
 def _join_columns(left: Array, right: Array) -> Array:
     """Concatenate columns; the left one's leading axes may be 1."""
-    left = np.broadcast_to(left, (*right.shape[:-1], left.shape[-1]))
-    return np.concatenate([left, right], axis=-1)
+    shape = (*right.shape[:-1], left.shape[-1])
+    return np.concatenate([np.broadcast_to(left, shape), right], axis=-1)
 
 
 @validated
@@ -319,11 +319,11 @@ def _minimize(covs: Array, present: Mask, *, determinant: bool) -> Array:
     for _ in range(_MAX_STEPS):
         value, slope, curvature = problem.derivatives(weights)
         mean = (weights * slope).sum(axis=-1, keepdims=True)
-        gap = slope.max(axis=-1) / mean[:, 0] - 1
+        duality_gap = slope.max(axis=-1) / mean[:, 0] - 1
         # A converged fusion stays: that others need more steps must not change it.
-        improved = (gap < smallest_gap) & (smallest_gap > _GAP_TOLERANCE)
+        improved = (duality_gap < smallest_gap) & (smallest_gap > _GAP_TOLERANCE)
         best[index[improved]] = weights[improved]
-        smallest_gap = np.where(improved, gap, smallest_gap)
+        smallest_gap = np.where(improved, duality_gap, smallest_gap)
         is_open = smallest_gap > _GAP_TOLERANCE
         if not is_open.any():
             break

@@ -125,6 +125,7 @@ def kalman_filter(
     """
     runs, y, x, p = flatten_runs(mean, cov, observations)
     f, h, q, r = repeat_per_step(len(y), F=F, H=H, Q=Q, R=R)
+    # A contiguous copy is faster in the loop.
     f_transposed = np.ascontiguousarray(f.mT)
     if _share_covariance(cov, y):
         # One covariance for all runs, whose means are the columns of one matrix.
@@ -162,6 +163,7 @@ def kalman_filter(
 
 def _share_covariance(cov: Array, y: Array) -> bool:
     """Whether all runs have one prior covariance and the same missing components."""
+    # Patterns are compared with that of the first run.
     missing = np.isnan(y)
     return cov.ndim == 2 and bool((missing == missing[:, :1]).all())
 
@@ -240,6 +242,7 @@ def rts_smoother(
     identity = np.eye(run.dim)
     means = run.means.copy()
     covs = run.covariances.copy()
+    # Backwards from the last state, whose filtered estimate is the smoothed one.
     for k in reversed(range(len(f) - 1)):
         x = run.means[k]
         p = run.covariances[k]
@@ -264,6 +267,7 @@ def flatten_runs(
 
     Returns the axes, observations (T, R, m), means (R, d) and covariances (R, d, d).
     """
+    # The run axes of all three arguments broadcast.
     runs = broadcast_leading(observations.shape[1:-1], mean.shape[:-1], "mean")
     runs = broadcast_leading(runs, cov.shape[:-2], "cov")
     steps = len(observations)
@@ -284,6 +288,7 @@ def unflatten_runs(
 ) -> FilterResult:
     """Restore the run axes of results (T, R, ...); axes of length 1 for a shared covariance."""
     steps = len(means)
+    # R runs have a covariance each, or share one.
     cov_runs = runs if covs.shape[1] == math.prod(runs) else (1,) * len(runs)
     return FilterResult.construct(
         means.reshape(steps, *runs, means.shape[-1]),
@@ -301,6 +306,7 @@ def repeat_per_step(steps: int, **matrices: Array) -> list[Array]:
             raise ValueError(
                 f"{name} must have shape {size} or {(steps, *size)}, got {matrix.shape}"
             )
+        # Views: a constant matrix is not copied.
         repeated.append(np.broadcast_to(matrix, (steps, *size)))
     return repeated
 

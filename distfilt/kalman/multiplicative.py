@@ -81,6 +81,7 @@ class QuaternionChart(FrozenModel):
     def retract(self, x: Array, e: Array) -> Array:
         """Move states (..., d) by errors (..., k)."""
         i = self.first
+        # Components before and after the quaternion are plain vectors.
         before = x[..., :i] + e[..., :i]
         quaternion = rotate(x[..., i : i + 4], e[..., i : i + 3])
         after = x[..., i + 4 :] + e[..., i + 3 :]
@@ -89,6 +90,7 @@ class QuaternionChart(FrozenModel):
     def local(self, x: Array, other: Array) -> Array:
         """Error that moves x to `other`, the inverse of `retract`."""
         i = self.first
+        # Also of the quaternion's components, which are replaced by the angle.
         difference = other - x
         before = difference[..., :i]
         angle = rotation_vector_between(x[..., i : i + 4], other[..., i : i + 4])
@@ -98,6 +100,7 @@ class QuaternionChart(FrozenModel):
     def tangent_basis(self, x: Array) -> Array:
         """Derivative B of `retract` with respect to the error, at zero, (..., d, k)."""
         i = self.first
+        # Identity but for the quaternion's block D(q)
         basis = np.zeros((*x.shape, self.error_dim))
         basis[..., :i, :i] = np.eye(i)
         basis[..., i : i + 4, i : i + 3] = left_directions(x[..., i : i + 4])
@@ -187,11 +190,13 @@ def mekf(
     >>> float((run.means[0, 9:] ** 2).sum().round(9)), run.covariances.shape
     (1.0, (1, 12, 12))
     """
+    # One sensor of all components, in the order of the observations.
     sensor = stack(sensors)
     if chart.dim != model.dim:
         raise ValueError(
             f"chart must have {model.dim} components, like the model, got {chart.dim}"
         )
+    # Each step begins at the time of the last observation, the first at 0.
     clock = prepend_prior_time(times, observations, sensor)
     runs, y, x, p = flatten_runs(mean, cov, observations)
     means = np.empty((len(y), *x.shape))
@@ -252,6 +257,7 @@ def _assimilate(
     """Analysis means (R, d), covariances (R, k, k), and log densities (R,) of observations."""
     innovation = sensor.residual(y, sensor.predict(forecast, previous))
     missing = np.isnan(innovation)
+    # Missing components have no innovation and no row in H.
     innovation = np.where(missing, 0.0, innovation)
     h = _error_jacobian(forecast, previous, sensor, chart)
     h = np.where(missing[..., None], 0.0, h)

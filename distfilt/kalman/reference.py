@@ -128,6 +128,7 @@ def filterpy_ekf(
     def step(kf: Any, k: int, z: Array, present: Mask) -> None:
         t = float(clock[k])
         dt = float(clock[k + 1] - clock[k])
+        # The linearisation is about the last analysis mean.
         kf.F = model.jacobian(kf.x, t, dt)
         kf.Q = model.Q(t, dt)
         forecast = model.step(kf.x, t, dt)
@@ -136,6 +137,7 @@ def filterpy_ekf(
         kf.x = forecast
         if present.any():
             # The observation is the residual, which the sensor wraps, and its prediction zero.
+            # Wrapped where the sensor wraps
             residual = sensor.residual(z, sensor.predict(forecast))[present]
             h = sensor.jacobian(forecast)[present]
             noise_cov = sensor.noise_cov[np.ix_(present, present)]
@@ -184,6 +186,7 @@ def filterpy_ukf(
     filterpy = import_optional("filterpy.kalman", "reference")
 
     def make() -> Any:
+        # α = 1, β = 0, κ = 1: the weights of all points are positive.
         points = filterpy.MerweScaledSigmaPoints(model.dim, 1.0, 0.0, 1.0)
         return filterpy.UnscentedKalmanFilter(
             model.dim, sensor.dim, 0.0, None, None, points
@@ -218,6 +221,7 @@ def _unwrap(
     predicted = sensor.predict(points)
     centre = np.broadcast_to(predicted[0], predicted.shape)
     predicted = predicted[0] + sensor.residual(predicted, centre)
+    # The mean of unwrapped predictions
     mean = weights @ predicted
     return predicted, mean + sensor.residual(observed, mean)
 
@@ -242,11 +246,13 @@ def _run_filterpy(
     step: Step,
 ) -> FilterResult:
     """Filter every run by a filter of filterpy of its own, step after step."""
+    # Runs one after the other: filterpy has no batches.
     runs, y, x, p = flatten_runs(mean, cov, observations)
     means = np.empty((len(y), *x.shape))
     covs = np.empty((len(y), *p.shape))
     log_likelihood = np.zeros(y.shape[:2])
     for run in range(len(x)):
+        # A new filter for each run: filterpy's filters have a state.
         kf = make()
         # filterpy changes its arrays in place.
         kf.x = x[run].copy()

@@ -354,10 +354,10 @@ def _fuse_components(
 
     # P_tt = S (I + Sᵀ Λ S)⁻¹ Sᵀ with the prior's own P_tt = S Sᵀ.
     root = np.linalg.cholesky(prior.covs[q, :n, :n])[:, None]
-    inner = np.eye(n) + root.mT @ symmetrise(information) @ root
+    relative = np.eye(n) + root.mT @ symmetrise(information) @ root
     is_matched = (q == p) & (len(divided.means) == prior.n_components)
     smallest_pivot = np.where(is_matched, _MATCHED_PIVOT, _UNMATCHED_PIVOT)
-    lower, is_definite = _factor_definite(inner, smallest_pivot[:, None])
+    lower, is_definite = _factor_definite(relative, smallest_pivot[:, None])
     half = np.linalg.solve(lower, np.broadcast_to(root.mT, lower.shape))
     target = half.mT @ half
 

@@ -185,8 +185,8 @@ def split_components(
     weights = mixture.weights[which][:, None] * piece_weights
     shifts = piece_means[:, None] * directions[:, None]
     means = mixture.means[which][:, None] + shifts
-    outer = (1 - std**2) * directions[:, :, None] * directions[:, None, :]
-    covs = np.repeat(symmetrise(mixture.covs[which] - outer), 3, axis=0)
+    products = (1 - std**2) * directions[:, :, None] * directions[:, None, :]
+    covs = np.repeat(symmetrise(mixture.covs[which] - products), 3, axis=0)
     unsplit = np.setdiff1d(np.arange(mixture.n_components), which)
     return GaussianMixture.construct(
         np.concatenate([mixture.weights[unsplit], weights.ravel()]),

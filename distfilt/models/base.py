@@ -11,7 +11,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ..linalg import evaluate_derivative, central_difference, factor
+from ..linalg import central_difference, evaluate_derivative, factor
 from ..validation import (
     Array,
     Bounds,
@@ -76,6 +76,7 @@ class Model(FrozenModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # Labels are optional, but complete if given.
         for name, labels in (("names", self.names), ("units", self.units)):
             if labels and len(labels) != self.dim:
                 raise ValueError(
@@ -140,7 +141,9 @@ class Model(FrozenModel):
 
         differences = partial(central_difference, move, x)
         shape = (*x.shape, self.dim)
-        return evaluate_derivative(self, (x, t, dt), shape, differences, np.eye(self.dim))
+        return evaluate_derivative(
+            self, (x, t, dt), shape, differences, np.eye(self.dim)
+        )
 
 
 @lru_cache(maxsize=64)
@@ -150,6 +153,7 @@ def _factorize_noise(data: bytes, dim: int) -> tuple[Array, Array]:
     check_array(cov, "noise_cov")
     check_positive_semidefinite(cov, "noise_cov")
     lower = factor(cov)
+    # The cached arrays are shared by all callers.
     lower.setflags(write=False)
     return cov, lower
 
@@ -234,6 +238,7 @@ class LinearModel(Model):
 
     def _is_transposed(self, t: float, dt: float, cov: Array) -> bool:
         """Whether Φᵀ in place of Φ makes two half steps add the noise of a whole step."""
+        # The noise of two half steps, propagated by Φ, is that of a whole step.
         half = dt / 2
         phi = self.F(half)
         first = call_user(self.noise_cov, t, half)
@@ -242,6 +247,7 @@ class LinearModel(Model):
         remainder = second - cov
         error = np.abs(phi @ first @ phi.T + remainder).max()
         transposed_error = np.abs(phi.T @ first @ phi + remainder).max()
+        # A clear case only: Φᵀ fits to rounding, and Φ misses by far.
         rounding = 1e-11 * np.abs(cov).max()
         return bool(transposed_error < rounding < 1e-2 * error)
 
@@ -316,6 +322,7 @@ def simulate(
     >>> simulate(walk, [0.0], [1.0, 2.0], rng=np.random.default_rng(1)).shape
     (2, 1)
     """
+    # Each step draws noise from the same generator.
     return trajectory(partial(model.sample_step, rng=rng), x0, times, t0)
 
 

@@ -79,6 +79,7 @@ def _straight_transition(dt: float, axes: int) -> Array:
 
 def _straight_noise(t: float, dt: float, sigma: float, axes: int) -> Array:
     q = sigma**2
+    # σ² (dt³/3, dt²/2; dt²/2, dt), the integral of white acceleration
     position = q * (dt**3 / 3)
     cross = q * (dt**2 / 2)
     velocity = q * dt
@@ -88,6 +89,7 @@ def _straight_noise(t: float, dt: float, sigma: float, axes: int) -> Array:
 @lru_cache(maxsize=64)
 def _repeat_along_axes(block: tuple[tuple[float, float], ...], axes: int) -> Array:
     """Kronecker product of a block with I, read-only and cached: few recur in every step."""
+    # All positions, then all velocities: block ⊗ I.
     matrix = np.asarray(np.kron(block, np.eye(axes)), dtype=np.float64)
     matrix.setflags(write=False)
     return matrix
@@ -136,6 +138,7 @@ def runge_kutta(
 ) -> Array:
     """Integrate like :func:`rk4`, without validation; `dt` may be negative."""
     steps = count_steps(abs(dt), longest)
+    # Equal steps: the last one ends at t + dt, up to rounding.
     h = dt / steps
     for k in range(steps):
         s = t + k * h
@@ -187,9 +190,7 @@ def integrate(
     )
 
 
-def _rk4_transition(
-    x: Array, t: float, dt: float, rate: Rate, longest: float
-) -> Array:
+def _rk4_transition(x: Array, t: float, dt: float, rate: Rate, longest: float) -> Array:
     # Fortran order: each component of all states is contiguous in memory, which is twice as fast.
     states = x.copy("F")
     return np.ascontiguousarray(runge_kutta(rate, states, t, dt, longest))
@@ -222,6 +223,7 @@ def lorenz63(*, sigma: NoiseStrength = 0.0, step: PositiveFloat = 0.01) -> Model
     >>> lorenz63().step([1.0, 1.0, 20.0], 0.0, 0.1).shape
     (3,)
     """
+    # Independent noise on each component
     density = sigma**2 * np.eye(3)
     return integrate(_lorenz_rate, density, step=step, names=_AXES, units=("1",) * 3)
 

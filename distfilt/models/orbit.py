@@ -208,6 +208,7 @@ def orbits(
     >>> pair.dim, pair.names[6], pair.units[3]
     (12, 'x2', 'm/s')
     """
+    # The same for each satellite, one after the other.
     variances = [position_std**2] * 3 + [velocity_std**2] * 3
     noise_cov = np.diag(np.tile(variances, bodies))
     components = ("x", "y", "z", "vx", "vy", "vz")
@@ -226,6 +227,7 @@ def _constant_noise(noise_cov: Array, t: float, dt: float) -> Array:
 
 
 def _transition(x: Array, t: float, dt: float) -> Array:
+    # Each satellite moves independently of the others.
     states = x.reshape(*x.shape[:-1], -1, 6)
     return propagate(states, dt).reshape(x.shape)
 
@@ -238,6 +240,7 @@ def _derivative(x: Array, t: float, dt: float, bodies: int) -> Array:
     # Axes: bodies, the component that is shifted, and the components where the orbit ends.
     forward, backward = _transition(np.stack([states + shifts, states - shifts]), t, dt)
     blocks = np.swapaxes((forward - backward) / (2 * step), -1, -2)
+    # Block diagonal
     jacobian = np.zeros((*x.shape, x.shape[-1]))
     for k in range(bodies):
         body = slice(6 * k, 6 * k + 6)
@@ -276,6 +279,7 @@ def rsw_frame(x: Orbits) -> Array:
             "x must have positions and velocities that span a plane, got parallel ones"
         )
     normal = normal / length
+    # Right-handed: S = W × R
     along = np.cross(normal, radial)
     return np.stack([radial, along, normal], axis=-1)
 
@@ -301,4 +305,5 @@ def occulted(a: Position, b: Position) -> Array:
     # a + s (b - a) is nearest to the Earth's centre at s = -a·(b - a)/|b - a|², within [0, 1].
     fraction = -np.einsum("...i,...i->...", a, line) / np.where(square > 0, square, 1.0)
     nearest = a + np.clip(fraction, 0, 1)[..., None] * line
+    # Hidden if the nearest point of the line is inside the sphere.
     return np.asarray(np.linalg.norm(nearest, axis=-1) < RADIUS)

@@ -64,6 +64,7 @@ def pendulum_rate(
     >>> pendulum_rate([1.0, 0.0, 0.0, 0.0])
     array([ 0. ,  0. , -0. ,  9.8])
     """
+    # The rate does not depend on time.
     return _rate(states, 0.0, length, gravity, form == "printed")
 
 
@@ -113,6 +114,7 @@ def pendulum(
     1.0
     """
     return integrate(
+        # The constraint is not enforced: it is kept by the equations only.
         partial(_rate, length=length, g=gravity, printed=form == "printed"),
         np.diag(np.repeat(sigma, 2) ** 2),
         step=step,
@@ -203,6 +205,7 @@ def pendulum_chart(states: States) -> Array:
     y = states[..., 1]
     u = states[..., 2]
     v = states[..., 3]
+    # The square of the length, which need not be L²
     square = x * x + y * y
     if (square == 0).any():
         raise ValueError(

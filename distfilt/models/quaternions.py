@@ -29,6 +29,7 @@ __all__ = [
 
 def _check_nonzero(value: Array, name: str) -> None:
     with np.errstate(over="ignore", under="ignore"):
+        # Underflow and overflow are refused below, without a warning.
         squares = (value**2).sum(axis=-1)
     # A length whose square underflows or overflows cannot be divided out.
     if not (np.isfinite(squares) & (squares > 1e-280)).all():
@@ -139,6 +140,7 @@ def rotate(quaternion: Quaternion, angle: Vector) -> Array:
     >>> rotate([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2]).round(4)
     array([0.7071, 0.    , 0.    , 0.7071])
     """
+    # Half the angle of rotation, |θ|/2
     half = 0.5 * np.linalg.norm(angle, axis=-1)[..., None]
     tangent = (left_directions(quaternion) @ angle[..., None])[..., 0]
     # cos(|θ|/2) q + sin(|θ|/2)/(|θ|/2) D(q) θ; numpy's sinc(x) is sin(πx)/(πx).
@@ -165,6 +167,7 @@ def rotation_vector_between(quaternion: Quaternion, other: Quaternion) -> Array:
     array([ 0.    ,  0.    , -1.5708])
     """
     start, end = np.broadcast_arrays(quaternion, other)
+    # R(end) R(start)⁻¹, whose rotation vector is at most π long
     rotation = _to_rotation(end) * _to_rotation(start).inv()
     return np.reshape(rotation.as_rotvec(), (*start.shape[:-1], 3))
 
@@ -184,6 +187,7 @@ def quaternion_rate(quaternion: Quaternion, angular_velocity: Vector) -> Array:
     >>> quaternion_rate([1.0, 0.0, 0.0, 0.0], [0.2, 0.0, 0.0]) + 0.0
     array([ 0. , -0.1,  0. ,  0. ])
     """
+    # Components first, for `component_rates`.
     q = np.moveaxis(quaternion, -1, 0)
     w = np.moveaxis(angular_velocity, -1, 0)
     return np.stack(component_rates(q, w), axis=-1)

@@ -26,7 +26,9 @@ __all__ = ["clohessy_wiltshire", "satellite_pose"]
 def _drift(rate: float) -> Array:
     """The matrix A, (6, 6), of the Clohessy-Wiltshire equations dx/dt = A x."""
     a = np.zeros((6, 6))
+    # Positions change by the velocities.
     a[:3, 3:] = np.eye(3)
+    # x'' = 3 n² x + 2 n y', y'' = -2 n x', z'' = -n² z
     a[3, 0] = 3 * rate * rate
     a[3, 4] = 2 * rate
     a[4, 3] = -2 * rate
@@ -63,6 +65,7 @@ def _noise_integral(rate: float, sigma: float, dt: float) -> Array:
     C. F. Van Loan, IEEE Transactions on Automatic Control 23 (1978) 395-404.
     """
     a = _drift(rate)
+    # White noise on all six rows of the equations
     density = sigma**2 * np.eye(6)
     # exp of [[-A, σ²], [0, Aᵀ]] dt is [[., Φ⁻¹ Q], [0, Φᵀ]].
     blocks = expm(dt * np.block([[-a, density], [np.zeros((6, 6)), a.T]]))
@@ -138,6 +141,7 @@ def satellite_pose(
 def _pose_noise(t: float, dt: float, rate: float, sigma: float) -> Array:
     cov = np.zeros((13, 13))
     cov[:6, :6] = _noise(t, dt, rate, sigma)
+    # No torque but white noise; the quaternion has none.
     cov[6:9, 6:9] = sigma**2 * dt * np.eye(3)
     return cov
 
@@ -147,6 +151,7 @@ def _pose_transition(x: Array, t: float, dt: float, rate: float, step: float) ->
     # Components first: each operation then runs over contiguous memory.
     rows = np.ascontiguousarray(x.reshape(-1, 13)[:, 6:].T)
     rows = runge_kutta(partial(_attitude_rate, alpha=rate), rows, t, dt, step)
+    # Back to states in rows
     attitude = rows.T.reshape(*x.shape[:-1], 7)
     return np.concatenate([translation, attitude], axis=-1)
 
@@ -168,6 +173,7 @@ def _angular_acceleration(q: Array, w: Array, alpha: float) -> list[Array]:
     """
     a, b, c, d = q
     w1, w2, w3 = w
+    # Squares of the quaternion's components
     aa = a * a
     bb = b * b
     cc = c * c

@@ -41,6 +41,7 @@ def _reflect(x: Array, low: Array, high: Array) -> Array:
 
 def check_inside(positions: Array, low: Array, high: Array) -> None:
     """Refuse positions (..., d) outside the box."""
+    # Walls belong to the box; NaN passes this comparison, and was refused before.
     outside = ((positions < low) | (positions > high)).any(axis=-1)
     if outside.any():
         raise ValueError(
@@ -52,6 +53,7 @@ def check_inside(positions: Array, low: Array, high: Array) -> None:
 def _expand_diffusion(value: ArrayLike, points: tuple[int, ...], dim: int) -> Array:
     """Validate a diffusion, isotropic or per axis, and broadcast it to (*points, d)."""
     diffusion = check_array(value, "diffusion")
+    # Isotropic: one number, or one at each point.
     if diffusion.shape in ((), points):
         diffusion = diffusion[..., None]
     elif diffusion.shape not in ((dim,), (*points, dim)):
@@ -113,6 +115,7 @@ class Swarm(FrozenModel):
             high = self.high.tolist()
             raise ValueError(f"high must be above low = {low}, got {high}")
         if not callable(self.diffusion):
+            # A copy of the caller's array; functions are checked when they are called.
             diffusion = _expand_diffusion(self.diffusion, (), self.dim).copy()
             object.__setattr__(self, "diffusion", diffusion)
 
@@ -167,6 +170,7 @@ class Swarm(FrozenModel):
     def _step(
         self, x: Array, t: float, dt: float, rng: np.random.Generator, substeps: int
     ) -> Array:
+        # Equal substeps of the Euler-Maruyama scheme
         h = dt / substeps
         for k in range(substeps):
             now = t + k * h
@@ -233,6 +237,7 @@ class RotatingMixture(FrozenModel):
     def means(self, t: float) -> Array:
         """Means of the components at time `t`, (K, 2)."""
         k = np.arange(self.components)
+        # Evenly spaced on the circle, at a common angular velocity
         angle = self.rate * t + self.phase + 2 * np.pi * k / self.components
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         return np.asarray(self.centre + self.radius * circle)
@@ -292,6 +297,7 @@ def rotating_swarm(
     >>> swarm.drift_at(np.array([[0.8, 0.6]]), 0.0).round(3)
     array([[-0.  , -0.15]])
     """
+    # Of a noise of strength s the diffusion is D = s²/2.
     half_square = strength**2 / 2
     mobility = half_square if interpretation == "slowgibbs" else strength
     diffusion = strength if interpretation == "gibbs" else half_square

@@ -59,8 +59,9 @@ def from_edges(
         numbers = numbers.reshape(-1, 2)
     numbers = check_array(numbers, name, ("E", 2))
     pairs = numbers.astype(np.int64)
-    whole = (pairs == numbers).all()
-    if not whole or pairs.min(initial=0) < 0 or pairs.max(initial=-1) >= n_agents:
+    # Fractions are refused, not truncated.
+    is_integer = (pairs == numbers).all()
+    if not is_integer or pairs.min(initial=0) < 0 or pairs.max(initial=-1) >= n_agents:
         raise ValueError(
             f"{name} must have agents from 0 to {n_agents - 1}, "
             f"got {numbers.tolist()[:3]}"
@@ -90,7 +91,8 @@ def _is_adjacency(numbers: np.ndarray, n_agents: int | None) -> bool:
     size = numbers.shape[0]
     if size == 0 or n_agents not in (None, size):
         return False
-    # Two edges look like a matrix of two agents, which has no self-loops and no number above 1.
+    # Two edges look like a matrix of two agents, which has no self-loops and no number
+    # above 1.
     looks_like_edges = numbers.diagonal().any() or (numbers > 1).any()
     return not (size == 2 and looks_like_edges)
 
@@ -113,7 +115,8 @@ def build_links(n_agents: int, pairs: Indices, name: str) -> scipy.sparse.csr_ar
     ones = np.ones(len(pairs))
     coordinates = (pairs[:, 0], pairs[:, 1])
     links = scipy.sparse.csr_array((ones, coordinates), (n_agents, n_agents))
-    # Repeated pairs add up; each link counts once. The order of links is that of the columns.
+    # Repeated pairs add up; each link counts once. The order of links is that of the
+    # columns.
     links.sum_duplicates()
     links.data[:] = 1.0
     links.sort_indices()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import partial
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -31,7 +32,7 @@ PerAgent = Annotated[Array, "*channel.runs channel.graph.n_agents k"]
 """One vector for each agent of an argument named `channel`."""
 
 LossRule = Literal["mutual", "metropolis", "keep", "renormalise", "zero"]
-"""What :meth:`Channel.mix` does about a lost message; the last three move the average."""
+"""Where :meth:`Channel.mix` puts the weight of a lost message; the last three move the average."""
 
 BeliefKind = Literal[
     "vectors", "ensembles", "gaussians", "mixtures", "densities", "particles"
@@ -42,9 +43,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 class Channel:
     """Deliver payloads along a graph's links, lose or delay some, and charge for all of them.
 
-    Everything that an agent learns from another passes through :meth:`broadcast` (any payload, to
-    all neighbours), :meth:`mix` (weighted sums of vectors, one sparse product) or
-    :meth:`send_on_links` (a different vector on each link).
+    Everything that an agent learns from another passes through :meth:`broadcast` (any
+    payload, to all neighbours), :meth:`mix` (weighted sums of vectors, one sparse
+    product) or :meth:`send_on_links` (a different vector on each link).
 
     Parameters
     ----------
@@ -53,8 +54,8 @@ class Channel:
     ledger : Ledger, optional
         The ledger so far; empty by default. Its count of rounds numbers the losses.
     runs : tuple of int
-        Leading axes of every payload that are independent runs of the same network. They are
-        charged once, and lose different messages.
+        Leading axes of every payload that are independent runs of the same network.
+        They are charged once, and lose different messages.
     faults : Faults, optional
         How the channel fails; not at all by default. A delay is for :meth:`mix` alone.
     t : float, optional
@@ -90,7 +91,8 @@ class Channel:
         # Losses are drawn for `_n_drawn` runs, of which this channel's are `_drawn`.
         self._n_drawn = int(np.prod(runs, dtype=np.int64))
         self._drawn = slice(None)
-        # Rounds without faults that are not yet in the ledger, by the size of a message.
+        # Rounds without faults that are not yet in the ledger, by the size of a
+        # message.
         self._uncharged: dict[int, int] = {}
         # Messages on their way in a channel with a delay, by the shape of the values.
         self._queues: dict[tuple[int, ...], deque[tuple[Array, Mask]]] = {}
@@ -109,10 +111,11 @@ class Channel:
 
         A single run, an array without axes, loses the messages that it loses among all.
         """
-        channel = Channel.construct(
-            self.graph, ledger=ledger, runs=run.shape, faults=self.faults, t=self.t
-        )
-        channel._n_drawn = self._n_drawn
+        channel = copy(self)
+        channel.runs = run.shape
+        channel._ledger = ledger
+        channel._uncharged = {}
+        channel._queues = {}
         channel._drawn = slice(None) if run.ndim else slice(run, run + 1)
         return channel
 
@@ -129,19 +132,21 @@ class Channel:
         Parameters
         ----------
         payloads : sequence of length A
-            Per agent a numeric array (*runs, ...), a flat tuple of them, or None to stay silent.
-            Each entry counts as one scalar, of its own item size. Missing entries are not sent:
-            those that are NaN in all runs cost nothing, and a payload of NaN alone is silence.
+            Per agent a numeric array (*runs, ...), a flat tuple of them, or None to
+            stay silent. Each entry counts as one scalar, of its own item size. Missing
+            entries are not sent: those that are NaN in all runs cost nothing, and a
+            payload of NaN alone is silence.
 
         Returns
         -------
         list of dict
-            The payloads that each agent receives, by sender, ascending; the arrays are read-only.
-            In a batch, the runs that lost a message find NaN in its place, and integers become
-            floats there.
+            The payloads that each agent receives, by sender, ascending; the arrays are
+            read-only. In a batch, the runs that lost a message find NaN in its place,
+            and integers become floats there.
         """
         graph = self.graph
         sent, scalars, bytes_ = count_payload(payloads, graph.n_agents, self.runs)
+        # A link is used if its sender is not silent.
         sends = np.array([payload is not None for payload in sent])
         arrived = self._transmit(sends[graph.senders], scalars, bytes_)
         # A message is in the inbox if any run has received it.
@@ -177,8 +182,8 @@ class Channel:
             Where the weight of a lost message goes.
 
             - ``"mutual"``: a link counts only if both its messages arrive, which acknowledgements
-              tell; its weight goes to the own value on both sides. Keeps the average for
-              symmetric weights.
+              tell; its weight goes to the own value on both sides. Keeps the average
+              for symmetric weights.
             - ``"metropolis"``: the same, and the weights are the Metropolis weights of the links
               that are left; the given ones are not used.
             - ``"keep"``: to the receiver's own value. ``"renormalise"``: to all values that it
@@ -206,9 +211,11 @@ class Channel:
         Parameters
         ----------
         values : array_like, (*runs, E, k)
-            One vector per link, in the order of ``graph.receivers`` and ``graph.senders``.
+            One vector per link, in the order of ``graph.receivers`` and
+            ``graph.senders``.
         links : array_like of bool, (E,), optional
-            The links that are used in this round; all by default. The others are not charged.
+            The links that are used in this round; all by default. The others are not
+            charged.
         acknowledged : bool
             Charge an acknowledgement of one byte for each message, to its receiver.
 
@@ -226,7 +233,8 @@ class Channel:
     def _mix_without_faults(
         self, values: Array, weights: ConsensusWeights, rounds: int
     ) -> Array:
-        # The ledger is brought up to date when it is read: it would cost more than the product.
+        # The ledger is brought up to date when it is read: it would cost more than the
+        # product.
         size = values.shape[-1]
         self._uncharged[size] = self._uncharged.get(size, 0) + rounds
         # One sparse product for all runs and components, agents first.
@@ -245,20 +253,22 @@ class Channel:
             mixed = self._mix_without_faults(values, weights, 1)
             return mixed, weights.self_weights
         both_ways = on_loss in ("mutual", "metropolis")
-        if both_ways and self.graph.directed:
+        if both_ways and self.graph.is_directed:
             raise ValueError(
                 "on_loss must not be "
                 f"{on_loss!r} on a graph with one-way links, which needs links both ways"
             )
         size = values.shape[-1]
-        # Metropolis weights need the degree of the links that are left, one number more.
+        # Metropolis weights need the degree of the links that are left, one number
+        # more.
         numbers = size + 1 if on_loss == "metropolis" else size
         arrived = self._transmit_numbers(
             numbers, acknowledged=both_ways, may_delay=True
         )
         flat = values.reshape(-1, size)
         if self.faults.total_delay:
-            # Own values are present, received ones late: they stand below in one product.
+            # Own values are present, received ones late: they stand below in one
+            # product.
             received, arrived = self._delay(flat, arrived)
             factors = np.concatenate([flat, received])
             offset = len(flat)
@@ -322,9 +332,7 @@ class Channel:
         else:
             # Radios that are off send nothing, which costs nothing.
             used = used & self.faults.active_links(graph, ledger.rounds, self.t)
-            draws = self.faults.lost_messages(
-                graph, ledger.rounds, self._n_drawn, self.t
-            )
+            draws = self.faults.draw_losses(graph, ledger.rounds, self._n_drawn, self.t)
             arrived = used & ~draws[self._drawn]
             # The ledger has the mean over the runs.
             missing = (used & ~arrived).mean(axis=0)
@@ -378,7 +386,8 @@ def _group_by_receiver(
 ) -> list[dict[int, Any]]:
     """Return for each agent the messages on some links, ascending numbers, by sender."""
     senders = graph.senders[links].tolist()
-    # Links are ordered by receiver: agent i has those from bounds[i] to before bounds[i + 1].
+    # Links are ordered by receiver: agent i has those from bounds[i] to before bounds[i
+    # + 1].
     agents = np.arange(graph.n_agents + 1)
     bounds = np.searchsorted(graph.receivers[links], agents).tolist()
     inbox = []
@@ -399,9 +408,11 @@ def _weights_after_loss(
     if on_loss == "metropolis":
         degrees = sum_links(arrived.astype(np.float64))
         larger = np.maximum(degrees[:, receivers], degrees[:, graph.senders])
+        # w_ij = 1 / (1 + max(d_i, d_j)) with the degrees of this round.
         link_weights = arrived / (1 + larger)
         return 1 - sum_links(link_weights), link_weights
 
+    # A lost message has no weight; for "zero" that is all.
     link_weights = weights.link_weights * arrived
     shape = (arrived.shape[0], graph.n_agents)
     self_weights = np.broadcast_to(weights.self_weights, shape)
@@ -415,13 +426,14 @@ def _weights_after_loss(
                 "on_loss must not be 'renormalise' where the weights of received messages "
                 "and of the own value sum to 0"
             )
+        # Rows sum to one again.
         self_weights = self_weights / total
         link_weights = link_weights / total[:, receivers]
     return np.asarray(self_weights), link_weights
 
 
 def fusion_rule(kind: BeliefKind) -> Callable[[F], F]:
-    """Declare what a fusion rule fuses, so that a filter can refuse a rule of another kind.
+    """Declare a rule's kind of belief, so that a filter can refuse one of another kind.
 
     Parameters
     ----------
@@ -445,7 +457,7 @@ def fusion_rule(kind: BeliefKind) -> Callable[[F], F]:
 
 
 def kind_of_rule(rule: Callable[..., Any]) -> str | None:
-    """Return what a rule declares to fuse, also if a partial gives it options; None if nothing.
+    """Return the kind of belief that a rule declares, through partials; None without a declaration.
 
     >>> from distfilt.network import average_consensus
     >>> kind_of_rule(partial(average_consensus, rounds=3)), kind_of_rule(print)

@@ -86,14 +86,16 @@ def average_consensus(
         On a graph that is not connected each component reaches its own average.
     rounds : int
         Number of rounds. More than one on a graph of several components give a
-        :class:`Disconnected` warning; one does not, as a graph that changes may be connected over
-        time.
+        :class:`Disconnected` warning; one does not, as a graph that changes may be
+        connected over time.
     gain : float, optional
-        The gain γ, positive. The values converge to the average if and only if the graph is
-        connected and γ < 2/λ_max of its Laplacian; above that an :class:`UnstableGain` warns.
+        The gain γ, positive. The values converge to the average if and only if the
+        graph is connected and γ < 2/λ_max of its Laplacian; above that an
+        :class:`UnstableGain` warns.
     weights : ConsensusWeights, optional
-        Weights in place of a gain; Metropolis by default. They must keep the average: symmetric
-        ones do, and :func:`distfilt.network.weights.doubly_stochastic` on a digraph.
+        Weights in place of a gain; Metropolis by default. They must keep the average:
+        symmetric ones do, and :func:`distfilt.network.weights.doubly_stochastic` on a
+        digraph.
     on_loss : str
         Where the weight of a lost message goes: see :meth:`Channel.mix`.
 
@@ -116,7 +118,7 @@ def average_consensus(
     elif weights is None:
         weights = metropolis(graph)
     _check_keeps_average(weights)
-    if rounds > 1 and not graph.connected:
+    if rounds > 1 and not graph.is_connected:
         count = graph.components.max() + 1
         warnings.warn(
             "channel must have a connected graph to reach one average, "
@@ -141,19 +143,20 @@ def finite_time_consensus(values: PerAgent, channel: Channel) -> Array:
     Parameters
     ----------
     values, channel
-        As for :func:`average_consensus`. Connected, with links both ways, and without faults: one
-        lost message spoils the product.
+        As for :func:`average_consensus`. Connected, with links both ways, and without
+        faults: one lost message spoils the product.
 
     Raises
     ------
     ValueError
-        If rounding would spoil it too, as it does for many, unevenly spaced eigenvalues: of twenty
-        agents with a hub, or of a hundred at random. Use :func:`average_consensus` there.
+        If rounding would spoil it too, as it does for many, unevenly spaced
+        eigenvalues: of twenty agents with a hub, or of a hundred at random. Use
+        :func:`average_consensus` there.
 
     Notes
     -----
-    The factors are applied in Leja's order, large ones between small ones, which keeps rounding
-    errors small on rings, paths and grids.
+    The factors are applied in Leja's order, large ones between small ones, which keeps
+    rounding errors small on rings, paths and grids.
 
     Examples
     --------
@@ -168,14 +171,14 @@ def finite_time_consensus(values: PerAgent, channel: Channel) -> Array:
     graph._check_connected()
     _check_faultless(channel)
     mixed = values.copy()
-    for eigenvalue in _ordered_eigenvalues(graph):
+    for eigenvalue in _order_eigenvalues(graph):
         # The factor I - L/λ is an averaging step with the gain 1/λ.
         mixed = channel.mix(mixed, _laplacian_weights(graph, 1 / eigenvalue))
     return mixed
 
 
 @lru_cache(maxsize=32)
-def _ordered_eigenvalues(graph: Graph) -> list[float]:
+def _order_eigenvalues(graph: Graph) -> list[float]:
     """Return the distinct nonzero eigenvalues in Leja's order, if rounding permits."""
     eigenvalues = _leja_order(_drop_repeated(graph.laplacian_spectrum[1:]))
     # Applied to I - 11ᵀ/A the product is zero, but for rounding.
@@ -201,7 +204,8 @@ def _drop_repeated(ascending: Array) -> Array:
 def _leja_order(ascending: Array) -> list[float]:
     """Return ascending points in an order in which partial products of their factors stay small.
 
-    The first is the largest; each next one is farthest, in the geometric mean, from all before it.
+    The first is the largest; each next one is farthest, in the geometric mean, from all
+    before it.
     """
     log_distance = np.zeros(ascending.size)
     order = [float(p) for p in ascending[-1:]]
@@ -218,10 +222,10 @@ def _leja_order(ascending: Array) -> list[float]:
 def push_sum(values: PerAgent, channel: Channel, *, rounds: PositiveInt) -> Array:
     r"""Average on any strongly connected digraph, despite lost messages, without acknowledgements.
 
-    Each agent pushes equal parts of its value and of a weight that started at one; the ratio of
-    the two tends to the average. On each link it sends the *running sum* of all that it has pushed
-    there. The receiver takes the increase since the last sum that arrived, so that a lost message
-    is made good by the next.
+    Each agent pushes equal parts of its value and of a weight that started at one; the
+    ratio of the two tends to the average. On each link it sends the *running sum* of
+    all that it has pushed there. The receiver takes the increase since the last sum
+    that arrived, so that a lost message is made good by the next.
 
     Parameters
     ----------
@@ -237,8 +241,8 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: PositiveInt) -> Arra
 
     Notes
     -----
-    D. Kempe, A. Dobra and J. Gehrke, Foundations of Computer Science (2003) 482-491; running sums:
-    N. H. Vaidya, C. N. Hadjicostis and A. D. Dominguez-Garcia (2011).
+    D. Kempe, A. Dobra and J. Gehrke, Foundations of Computer Science (2003) 482-491;
+    running sums: N. H. Vaidya, C. N. Hadjicostis and A. D. Dominguez-Garcia (2011).
 
     Examples
     --------
@@ -252,6 +256,7 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: PositiveInt) -> Arra
     # Value and weight of each agent, which move together.
     ones = np.ones((*values.shape[:-1], 1))
     mass = np.concatenate([values, ones], axis=-1)
+    # Equal parts for the agent itself and for each of its receivers.
     part = 1 / (1 + graph.out_degree)[:, None]
     pushed = np.zeros_like(mass)
     # The last running sum that arrived on each link.
@@ -259,9 +264,12 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: PositiveInt) -> Arra
     for _ in range(rounds):
         pushed = pushed + part * mass
         arrived = channel.send_on_links(pushed[..., graph.senders, :])
+        # Where a message is lost the last sum stays, and the next one brings both
+        # increases.
         latest = np.where(np.isnan(arrived), received, arrived)
         mass = part * mass + graph._sum_by_receiver(latest - received)
         received = latest
+    # The ratio of value and weight is the estimate of the average.
     return np.asarray(mass[..., :-1] / mass[..., -1:])
 
 
@@ -290,7 +298,8 @@ def max_consensus(
     largest = values.copy()
     if graph.n_agents == 1:
         return largest
-    # Links are ordered by receiver, and each agent of a connected graph has one or more.
+    # Links are ordered by receiver, and each agent of a connected graph has one or
+    # more.
     row_starts = graph.links.indptr[:-1]
     for _ in range(rounds or graph.diameter):
         arrived = channel.send_on_links(largest[..., graph.senders, :])
@@ -311,8 +320,8 @@ class AdmmResult(FrozenModel):
     iterations : int
         Number of iterations.
     primal, dual : float
-        The last residuals, over all agents: the largest difference of local and common variable,
-        and ρ times the largest change of the common variable.
+        The last residuals, over all agents: the largest difference of local and common
+        variable, and ρ times the largest change of the common variable.
 
     Examples
     --------
@@ -348,14 +357,14 @@ def admm(
     Parameters
     ----------
     local_solve : callable
-        ``local_solve(target, rho) -> U`` on (A, k): the proximal step of every agent for its
-        objective at its row of `target` = Z - W.
+        ``local_solve(target, rho) -> U`` on (A, k): the proximal step of every agent
+        for its objective at its row of `target` = Z - W.
     start : array_like, (A, k)
         Each agent's first Z.
     channel : Channel
-        A single run, connected, without faults. After every iteration the agents agree on their
-        largest residuals, so that all stop at once: :func:`max_consensus` of 2 scalars, as many
-        rounds as the diameter, charged like everything else.
+        A single run, connected, without faults. After every iteration the agents agree
+        on their largest residuals, so that all stop at once: :func:`max_consensus` of 2
+        scalars, as many rounds as the diameter, charged like everything else.
     rho : float
         Penalty, positive.
     tolerance : float
@@ -363,22 +372,24 @@ def admm(
     iterations : int
         At most this many.
     average : callable
-        ``average(values, channel) -> values``: a consensus rule for the average. With a rule that
-        is only approximate the agents' copies of Z differ.
+        ``average(values, channel) -> values``: a consensus rule for the average. With a
+        rule that is only approximate the agents' copies of Z differ.
 
     Raises
     ------
     SolverError
-        If the residuals are not below `tolerance` after `iterations`; the message has them.
+        If the residuals are not below `tolerance` after `iterations`; the message has
+        them.
 
     Notes
     -----
-    S. Boyd et al., Foundations and Trends in Machine Learning 3 (2010) 1-122, section 7.1; proposed
-    for (22) of Grange et al.
+    S. Boyd et al., Foundations and Trends in Machine Learning 3 (2010) 1-122, section
+    7.1; proposed for (22) of Grange et al.
 
     Examples
     --------
-    The average of private numbers, each the minimiser of its agent's :math:`(u-c_l)^2/2`:
+    The average of private numbers, each the minimiser of its agent's
+    :math:`(u-c_l)^2/2`:
 
     >>> from distfilt.network import Channel, graphs
     >>> c = np.array([[1.0], [2.0], [6.0]])
@@ -396,6 +407,7 @@ def admm(
     for iteration in range(1, iterations + 1):
         u = check_array(call_user(local_solve, z - w, rho), "local_solve", z.shape)
         new = check_array(call_user(average, u + w, channel), "average", z.shape)
+        # W is the scaled dual variable.
         w = w + u - new
         # Each agent's primal residual |U - Z| and dual residual ρ |Z - Z before|.
         local = np.abs(u - new).max(axis=1)

@@ -29,31 +29,33 @@ def event_triggered(
     .. math:: \mathbf x_i\leftarrow\mathbf x_i
         +\sum_j w_{ij}(\hat{\mathbf x}_j-\hat{\mathbf x}_i)
 
-    with the values :math:`\hat{\mathbf x}` that each link delivered last, which both its ends
-    know. The Metropolis weights are symmetric: they keep the average exactly, also when messages
-    are lost.
+    with the values :math:`\hat{\mathbf x}` that each link delivered last, which both
+    its ends know. The Metropolis weights are symmetric: they keep the average exactly,
+    also when messages are lost.
 
     Parameters
     ----------
     values : array_like, (A, k)
         One vector per agent.
     channel : Channel
-        Links both ways, a single run, no delay. Acknowledgements tell which messages were lost;
-        these are sent again.
+        Links both ways, a single run, no delay. Acknowledgements tell which messages
+        were lost; these are sent again.
     rounds : int
         Number of rounds.
     threshold : float
-        An agent sends its value if a component has changed by more than this; at least 0.
+        An agent sends its value if a component has changed by more than this; at least
+        0.
     decay : float
-        Factor of the threshold from round to round, in (0, 1]. Below 1 the values converge to the
-        average. With 1 their Euclidean distance from it is in the end at most
+        Factor of the threshold from round to round, in (0, 1]. Below 1 the values
+        converge to the average. With 1 their Euclidean distance from it is in the end
+        at most
         :math:`\sqrt{Ak}\,\|\mathbf I-\mathbf W\|\,c/(1-\rho)`, where c is the threshold and ρ the
         second largest modulus of the weights' eigenvalues.
 
     Notes
     -----
-    D. V. Dimarogonas, E. Frazzoli and K. H. Johansson, IEEE Transactions on Automatic Control 57
-    (2012) 1291-1297, in discrete time.
+    D. V. Dimarogonas, E. Frazzoli and K. H. Johansson, IEEE Transactions on Automatic
+    Control 57 (2012) 1291-1297, in discrete time.
 
     Examples
     --------
@@ -71,7 +73,8 @@ def event_triggered(
     x = values
     link_weights = metropolis(graph).link_weights[:, None]
     faulty = not channel.faults.is_perfect
-    # The value that each link delivered last; its sender knows it by the acknowledgement.
+    # The value that each link delivered last; its sender knows it by the
+    # acknowledgement.
     delivered = np.full((graph.senders.size, x.shape[1]), np.nan)
     for _ in range(rounds):
         present = x[graph.senders]
@@ -82,5 +85,6 @@ def event_triggered(
         # x̂_j - x̂_i over each link; zero as long as one of the two is missing.
         change = link_weights * (delivered - delivered[graph.reverse])
         x = x + graph.incidence @ np.where(np.isnan(change), 0.0, change)
+        # A smaller threshold in the next round, for convergence in the limit.
         threshold *= decay
     return x

@@ -42,38 +42,40 @@ class Faults(FrozenModel):
     Parameters
     ----------
     loss : float or array_like, (A,) or (A, A)
-        Probability that a message is lost, in [0, 1]; one for each receiver, or ``loss[i, j]`` for
-        messages from agent j to agent i.
+        Probability that a message is lost, in [0, 1]; one for each receiver, or
+        ``loss[i, j]`` for messages from agent j to agent i.
     seed : int
-        Of the losses. Whether a message is lost is a function of seed, run, round and link alone.
-        So every agent, or every process of a real network, can compute it, and no draw depends on
-        earlier draws.
+        Of the losses. Whether a message is lost is a function of seed, run, round and
+        link alone. So every agent, or every process of a real network, can compute it,
+        and no draw depends on earlier draws.
     burst_length : float, optional
-        Mean number of rounds for which a link that fails keeps failing. By default losses are
-        independent, which gives the shortest possible bursts, 1 / (1 - loss) rounds.
+        Mean number of rounds for which a link that fails keeps failing. By default
+        losses are independent, which gives the shortest possible bursts, 1 / (1 - loss)
+        rounds.
     delay : int
         Rounds by which a message arrives later, in a channel that lives as long; for
         :meth:`Channel.mix` alone.
     silent : collection of int
         Agents whose radio is off: they neither send nor receive.
     during : sequence of (start, stop), optional
-        Windows in which messages are lost and agents are silent: from `start` to before `stop`, in
-        s where the channel has a time `t`, as in filters, and in rounds of its ledger otherwise.
-        Always by default; `stop` may be infinite.
+        Windows in which messages are lost and agents are silent: from `start` to before
+        `stop`, in s where the channel has a time `t`, as in filters, and in rounds of
+        its ledger otherwise. Always by default; `stop` may be infinite.
     others : tuple of Faults
         Further faults; ``|`` fills it.
 
     Notes
     -----
-    Bursts are a two-state Markov chain on each link (E. N. Gilbert, Bell System Technical Journal
-    39 (1960) 1253-1265, with nothing lost in one state and everything in the other). One number is
-    drawn for each round. In most rounds it decides the next state whatever the last one was, and
-    the state in any round follows from the latest such round. It is exact from the first round on
-    and depends on no earlier computation.
+    Bursts are a two-state Markov chain on each link (E. N. Gilbert, Bell System
+    Technical Journal 39 (1960) 1253-1265, with nothing lost in one state and everything
+    in the other). One number is drawn for each round. In most rounds it decides the
+    next state whatever the last one was, and the state in any round follows from the
+    latest such round. It is exact from the first round on and depends on no earlier
+    computation.
 
     Examples
     --------
-    >>> Faults(loss=0.2, seed=7).lost_messages(
+    >>> Faults(loss=0.2, seed=7).draw_losses(
     ...     Graph.from_adjacency([[0, 1], [1, 0]]), 0, 5
     ... ).shape
     (5, 2)
@@ -102,7 +104,8 @@ class Faults(FrozenModel):
     def __post_init__(self) -> None:
         super().__post_init__()
         loss = np.asarray(self.loss)
-        # Independent losses repeat with probability p: runs of them last 1 / (1 - p) on average.
+        # Independent losses repeat with probability p: runs of them last 1 / (1 - p) on
+        # average.
         shortest = 1 / (1 - loss[loss < 1].max(initial=0.0))
         if self.burst_length is not None and self.burst_length < shortest * (1 - 1e-9):
             raise ValueError(
@@ -168,14 +171,14 @@ class Faults(FrozenModel):
                 off[list(faults.silent)] = True
         return ~(off[graph.receivers] | off[graph.senders])
 
-    def lost_messages(
+    def draw_losses(
         self, graph: Graph, round_: int, runs: int, t: float | None = None
     ) -> Mask:
         """Return which links lose the message of round `round_` in each run, (runs, E)."""
         lost = np.zeros((runs, graph.senders.size), dtype=bool)
         for faults in self._flatten():
             if np.any(faults.loss) and faults._is_active(round_, t):
-                lost |= faults._draw_losses(graph, round_, runs)
+                lost |= faults._draw_round(graph, round_, runs)
         return lost
 
     def _is_active(self, round_: int, t: float | None) -> bool:
@@ -185,7 +188,7 @@ class Faults(FrozenModel):
         now = round_ if t is None else t
         return any(start <= now < stop for start, stop in self.during)
 
-    def _draw_losses(self, graph: Graph, round_: int, runs: int) -> Mask:
+    def _draw_round(self, graph: Graph, round_: int, runs: int) -> Mask:
         """Return the losses of one round, (runs, E), whatever the window."""
         probability = self._link_probabilities(graph)
         link_bits = _link_bits(graph)
@@ -193,15 +196,16 @@ class Faults(FrozenModel):
         if self.burst_length is None:
             return np.asarray(uniform < probability)
 
-        # Gilbert's chain. A link that fails goes on with probability 1 - 1/burst_length =
-        # enter + stay; one that works fails next with probability enter. Its stationary
-        # probability of failing is then enter / (1 - stay) = loss.
+        # Gilbert's chain. A link that fails goes on with probability 1 - 1/burst_length
+        # = enter + stay; one that works fails next with probability enter. Its
+        # stationary probability of failing is then enter / (1 - stay) = loss.
         probability = np.broadcast_to(probability, link_bits.shape)
         random = (probability > 0) & (probability < 1)
         works = np.where(random, 1 - probability, 1.0)
         stay = np.where(random, 1 - 1 / (self.burst_length * works), 0.0).clip(0)
         enter = probability * (1 - stay)
-        # u < enter: lost. enter <= u < enter + stay: as in the round before. Else it arrives.
+        # u < enter: lost. enter <= u < enter + stay: as in the round before. Else it
+        # arrives.
         lost = uniform < enter
         unknown = np.nonzero(~lost & (uniform < enter + stay))
         self._look_back(lost, unknown, round_, link_bits, enter, stay)
@@ -225,7 +229,8 @@ class Faults(FrozenModel):
             uniform = _uniform(self._run_bits(earlier, runs)[:, run] ^ link_bits[link])
             fails = uniform < enter[link]
             decided = fails | (uniform >= (enter + stay)[link])
-            # The latest round that decides; argmax finds the first True, or 0 where there is none.
+            # The latest round that decides; argmax finds the first True, or 0 where
+            # there is none.
             latest = decided.argmax(axis=0)
             lost[run, link] = fails[latest, np.arange(run.size)]
             # The others go on from an earlier round.

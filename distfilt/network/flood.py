@@ -24,7 +24,8 @@ def flooding(
     values : array_like, (A, k)
         One vector per agent.
     channel : Channel
-        A single run. k + 1 scalars for each value that is forwarded; a lost one is not sent again.
+        A single run. k + 1 scalars for each value that is forwarded; a lost one is not
+        sent again.
     rounds : int, optional
         Number of rounds; by default until no agent has a new value to forward.
 
@@ -60,6 +61,7 @@ def flooding(
         for agent, inbox in enumerate(channel.broadcast(payloads)):
             for rows in inbox.values():
                 received[agent, rows[:, 0].astype(int)] = True
+        # Only first receptions are forwarded in the next round.
         new = received & ~known
         known = known | new
     average = [values[row].mean(axis=0) for row in known]

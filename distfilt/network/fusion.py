@@ -66,16 +66,19 @@ def covariance_intersection(
         \mathbf P^{-1}\mathbf m=\sum_j\omega_j\mathbf P_j^{-1}\mathbf m_j,\qquad
         \sum_j\omega_j=1
 
-    The result is the weighted geometric mean of the densities. As the weights sum to one, no
-    information is counted twice. If every input's covariance is an upper bound of the covariance of
-    its error, so is the result's, for any correlation of the errors.
+    The result is the weighted geometric mean of the densities. As the weights sum to
+    one, no information is counted twice. If every input's covariance is an upper bound
+    of the covariance of its error, so is the result's, for any correlation of the
+    errors.
 
     Parameters
     ----------
     belief : tuple (means, covs)
-        Each agent's mean, (*runs, A, d), and covariance, (*runs, A, d, d), positive definite.
+        Each agent's mean, (*runs, A, d), and covariance, (*runs, A, d, d), positive
+        definite.
     channel : Channel
-        Mean and covariance are sent on each link, d + d(d+1)/2 scalars. A lost message is left out.
+        Mean and covariance are sent on each link, d + d(d+1)/2 scalars. A lost message
+        is left out.
     rule : {"equal", "trace", "determinant", "min_trace", "min_determinant"}
         The weights ω: see :func:`distfilt.gaussians.intersection_weights`.
     rounds : int
@@ -83,8 +86,8 @@ def covariance_intersection(
 
     Notes
     -----
-    S. J. Julier and J. K. Uhlmann, American Control Conference (1997) 2369-2373. The weights in
-    closed form: W. Niehsen, FUSION (2002) 110-113.
+    S. J. Julier and J. K. Uhlmann, American Control Conference (1997) 2369-2373. The
+    weights in closed form: W. Niehsen, FUSION (2002) 110-113.
 
     Examples
     --------
@@ -110,9 +113,10 @@ def naive_fusion(
 ) -> Pair:
     """Multiply the densities as if their errors were independent, which counts shared data twice.
 
-    Right for a single fusion of independent estimates. Wrong as soon as agents exchange fused
-    estimates: the covariance shrinks in every round, the error does not. A baseline that shows it.
-    Parameters, returns and errors as for :func:`covariance_intersection`.
+    Right for a single fusion of independent estimates. Wrong as soon as agents exchange
+    fused estimates: the covariance shrinks in every round, the error does not. A
+    baseline that shows it. Parameters, returns and errors as for
+    :func:`covariance_intersection`.
 
     >>> from distfilt.network import Channel, graphs
     >>> two = naive_fusion(
@@ -123,6 +127,7 @@ def naive_fusion(
     """
 
     def fuse(received: _Received) -> Pair:
+        # All weights are one: the product of the densities.
         self_weights = np.ones(received.means.shape[:2])
         link_weights = received.arrived.astype(np.float64)
         return _sum_information(received, self_weights, link_weights)
@@ -141,9 +146,9 @@ def arithmetic_average(
         \mathbf P=\sum_j\omega_j\bigl(\mathbf P_j
         +(\mathbf m_j-\mathbf m)(\mathbf m_j-\mathbf m)^\top\bigr)
 
-    With equal weights. Differences between the means add to the covariance, so that an outlier
-    widens it.
-    Parameters, returns and errors as for :func:`covariance_intersection`.
+    With equal weights. Differences between the means add to the covariance, so that an
+    outlier widens it. Parameters, returns and errors as for
+    :func:`covariance_intersection`.
 
     >>> from distfilt.network import Channel, graphs
     >>> two = arithmetic_average(
@@ -158,7 +163,8 @@ def arithmetic_average(
         self_weights, link_weights = _intersection_weights(received, "equal")
         difference = received.mean_differences()
         shift = graph._sum_by_receiver(link_weights[..., None] * difference, 1)
-        # From the new mean the own one lies at -shift, a received one at difference - shift.
+        # From the new mean the own one lies at -shift, a received one at
+        # difference - shift.
         deviation = difference - shift[:, graph.receivers]
         weighted = link_weights[..., None, None] * deviation[..., :, None]
         spread = graph._sum_by_receiver(weighted * deviation[..., None, :], 1)
@@ -180,8 +186,8 @@ def consensus_pull(
     .. math:: \mathbf m_i\leftarrow\mathbf m_i
         +\gamma\sum_j(\mathbf m_j-\mathbf m_i)
 
-    The covariances are not changed. That is cheap, but they do not account for the pull, and are
-    wrong as soon as neighbours' errors are correlated.
+    The covariances are not changed. That is cheap, but they do not account for the
+    pull, and are wrong as soon as neighbours' errors are correlated.
 
     Parameters
     ----------
@@ -201,8 +207,8 @@ def consensus_pull(
 
     Notes
     -----
-    R. Olfati-Saber, IEEE Conference on Decision and Control (2007) 5492-5498, algorithm 3, where
-    the gain is a multiple of the covariance.
+    R. Olfati-Saber, IEEE Conference on Decision and Control (2007) 5492-5498, algorithm
+    3, where the gain is a multiple of the covariance.
 
     Examples
     --------
@@ -215,6 +221,7 @@ def consensus_pull(
     _warn_if_unstable(channel.graph, gain)
     means, covs = belief
     weights = _laplacian_weights(channel.graph, gain)
+    # m <- (I - γ L) m; the weight of a lost mean stays with the own one.
     means = channel.mix(means, weights, on_loss="keep", rounds=rounds)
     return means, covs.copy()
 
@@ -239,14 +246,16 @@ def mean_pull(
     ensembles : array_like, (*runs, A, N, d)
         One ensemble per agent.
     channel : Channel
-        Only means are sent on each link, d scalars a round. A mean that is lost does not pull.
+        Only means are sent on each link, d scalars a round. A mean that is lost does
+        not pull.
     gain : float
         The gain γ, at least 0; 0 sends nothing and changes nothing.
     rounds : int
         Number of rounds.
     include_self : bool
-        Whether Nbs(l) holds l itself, as the paper's tables print. It does not change the means.
-        The spread shrinks by the factor 1 - γ|Nbs(l)|, in which l itself then counts.
+        Whether Nbs(l) holds l itself, as the paper's tables print. It does not change
+        the means. The spread shrinks by the factor 1 - γ|Nbs(l)|, in which l itself
+        then counts.
 
     Warns
     -----
@@ -270,7 +279,8 @@ def mean_pull(
     for _ in range(rounds):
         means = pulled.mean(axis=-2)
         new_means, self_weights = channel._mix_once(means, weights, "keep")
-        # All members get the same shift of the mean, and their deviations the factor 1 - γ |Nbs|.
+        # All members get the same shift of the mean, and their deviations the factor 1
+        # - γ |Nbs|.
         factor = (self_weights - gain * include_self)[..., None, None]
         deviations = pulled - means[..., None, :]
         pulled = new_means[..., None, :] + factor * deviations
@@ -289,9 +299,9 @@ def intersect_ensembles(
 ) -> Array:
     """Fuse sample means and covariances by covariance intersection, and move ensembles to them.
 
-    Consistent for any correlation of the agents' errors, which is strong in a network that
-    exchanges observations. The rule is :func:`covariance_intersection`; an affine map then gives
-    each ensemble the fused moments.
+    Consistent for any correlation of the agents' errors, which is strong in a network
+    that exchanges observations. The rule is :func:`covariance_intersection`; an affine
+    map then gives each ensemble the fused moments.
 
     Parameters
     ----------
@@ -302,8 +312,8 @@ def intersect_ensembles(
     rule : {"equal", "trace", "determinant", "min_trace", "min_determinant"}
         As for :func:`covariance_intersection`.
     scale : array_like, (d,), optional
-        A scale of each component. Components are divided by it, so that a trace does not add
-        variances of different units.
+        A scale of each component. Components are divided by it, so that a trace does
+        not add variances of different units.
     rounds : int
         Number of rounds.
 
@@ -319,8 +329,11 @@ def intersect_ensembles(
     x = ensembles / unit
     means = mean(x)
     covs = sample_covariance(x)
+    # Singular if an ensemble has no more members than components.
     check_positive_definite(covs, "ensembles")
     fused = covariance_intersection((means, covs), channel, rule=rule, rounds=rounds)
+    # The affine map from the sample moments to the fused ones, in the given units
+    # again.
     return match_moments(x, *fused) * unit
 
 
@@ -371,8 +384,9 @@ def _intersection_weights(received: _Received, rule: Rule) -> Pair:
     graph = received.graph
     size = np.ones(received.means.shape[:2])
     if rule != "equal":
-        # Weights are proportional to a size of each covariance: its weight against a unit
-        # covariance, over that one's. No agent's number depends on another's in any digit.
+        # Weights are proportional to a size of each covariance: its weight against a
+        # unit covariance, over that one's. No agent's number depends on another's in
+        # any digit.
         unit = np.eye(received.means.shape[-1])
         units = np.broadcast_to(unit, received.covs.shape)
         pairs = np.stack([received.covs, units], axis=-3)
@@ -380,6 +394,7 @@ def _intersection_weights(received: _Received, rule: Rule) -> Pair:
         size = pair_weights[..., 0] / pair_weights[..., 1]
     link_sizes = size[:, graph.senders] * received.arrived
     total = size + graph._sum_by_receiver(link_sizes, 1)
+    # Normalise each agent's sizes to weights.
     return size / total, link_sizes / total[:, graph.receivers]
 
 
@@ -391,7 +406,8 @@ def _optimal_weights(received: _Received, rule: Rule) -> Pair:
     link_weights = np.zeros(received.arrived.shape)
     for degree in np.unique(graph.in_degree):
         agents = np.flatnonzero(graph.in_degree == degree)
-        # The links of these agents, (agents, degree), which are neighbours in the order of links.
+        # The links of these agents, (agents, degree), which are neighbours in the order
+        # of links.
         links = graph.links.indptr[agents, None] + np.arange(int(degree))
         arrived = received.arrived[:, links]
         sent = received.covs[:, graph.senders[links]]
@@ -412,8 +428,8 @@ def _sum_information(
     graph = received.graph
     information = _invert(received.covs)
     covs = _invert(received.sum_matrices(self_weights, link_weights, information))
-    # m = m_i + P Σ_j ω_j P_j⁻¹ (m_j - m_i): about the own mean, so that equal means stay and large
-    # ones lose no digits.
+    # m = m_i + P Σ_j ω_j P_j⁻¹ (m_j - m_i): about the own mean, so that equal means
+    # stay and large ones lose no digits.
     difference = received.mean_differences()[..., None]
     pull = (information[:, graph.senders] @ difference)[..., 0]
     total_pull = graph._sum_by_receiver(link_weights[..., None] * pull, 1)

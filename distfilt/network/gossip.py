@@ -19,17 +19,17 @@ def gossip_consensus(
 
     .. math:: \mathbf x_i,\mathbf x_j\leftarrow\tfrac12(\mathbf x_i+\mathbf x_j)
 
-    No clock is shared, and the average is kept exactly. The expected squared disagreement shrinks
-    in each round at least by the factor of the second largest eigenvalue of the expected matrix,
-    :func:`distfilt.network.weights.expected_gossip`.
+    No clock is shared, and the average is kept exactly. The expected squared
+    disagreement shrinks in each round at least by the factor of the second largest
+    eigenvalue of the expected matrix, :func:`distfilt.network.weights.expected_gossip`.
 
     Parameters
     ----------
     values : array_like, (*runs, A, k)
         One vector per agent.
     channel : Channel
-        Links both ways, no delay. If one of a pair's two messages is lost, which acknowledgements
-        tell, the pair keeps its values.
+        Links both ways, no delay. If one of a pair's two messages is lost, which
+        acknowledgements tell, the pair keeps its values.
     rounds : int
         Number of pairs; 2 messages of k scalars each.
     rng : numpy.random.Generator
@@ -37,8 +37,8 @@ def gossip_consensus(
 
     Notes
     -----
-    S. Boyd, A. Ghosh, B. Prabhakar and D. Shah, IEEE Transactions on Information Theory 52 (2006)
-    2508-2530.
+    S. Boyd, A. Ghosh, B. Prabhakar and D. Shah, IEEE Transactions on Information Theory
+    52 (2006) 2508-2530.
 
     Examples
     --------
@@ -75,6 +75,7 @@ def gossip_consensus(
     packet = np.zeros((*channel.runs, graph.senders.size, averaged.shape[-1]))
     in_use = np.zeros(graph.senders.size, dtype=bool)
     for agent, choice in zip(agents.tolist(), choices.tolist(), strict=True):
+        # An agent without neighbours spends its round.
         if graph.in_degree[agent] == 0:
             continue
         link = int(graph.links.indptr[agent]) + choice

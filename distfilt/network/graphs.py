@@ -35,8 +35,9 @@ _DENSE = 200
 class Graph(FrozenModel):
     """A communication graph: links between agents, without self-loops.
 
-    Build it with :meth:`from_adjacency`, :meth:`from_edges`, :meth:`from_networkx` or a function of
-    :mod:`distfilt.network.graphs`. A graph that changes in time is a function ``t -> Graph``.
+    Build it with :meth:`from_adjacency`, :meth:`from_edges`, :meth:`from_networkx` or a
+    function of :mod:`distfilt.network.graphs`. A graph that changes in time is a
+    function ``t -> Graph``.
 
     Parameters
     ----------
@@ -108,12 +109,12 @@ class Graph(FrozenModel):
         Parameters
         ----------
         graph : networkx.Graph or networkx.DiGraph
-            Of a digraph an edge runs from sender to receiver. Names, weights and parallel edges
-            are not kept.
+            Of a digraph an edge runs from sender to receiver. Names, weights and
+            parallel edges are not kept.
         names : sequence of str
-            Names of the agents. If the nodes are these names, or the numbers 0 to A - 1, each node
-            is the agent of its label; otherwise nodes are numbered in the graph's order. A graph
-            in which only some nodes are names is refused.
+            Names of the agents. If the nodes are these names, or the numbers 0 to A -
+            1, each node is the agent of its label; otherwise nodes are numbered in the
+            graph's order. A graph in which only some nodes are names is refused.
 
         Examples
         --------
@@ -142,12 +143,12 @@ class Graph(FrozenModel):
                     f"graph must have the nodes {list(names)}, got {nodes}"
                 )
         number_of = {node: number for number, node in enumerate(order)}
-        # An edge (u, v) of networkx runs from u to v, a pair here is (receiver, sender). Edges of
-        # a multigraph have a key as third entry.
+        # An edge (u, v) of networkx runs from u to v, a pair here is (receiver,
+        # sender). Edges of a multigraph have a key as third entry.
         edges = [(number_of[edge[1]], number_of[edge[0]]) for edge in graph.edges]
         return cls.from_edges(len(nodes), edges, directed=bool(graph.is_directed()))
 
-    @property
+    @cached_property
     def n_agents(self) -> int:
         """Number A of agents."""
         return int(self.links.shape[0])
@@ -167,7 +168,8 @@ class Graph(FrozenModel):
     def reverse(self) -> Indices:
         """The number of the opposite link of each link, (E,), of an undirected graph."""
         self._check_undirected()
-        # Links are ordered by (receiver, sender); sorted by (sender, receiver) they are opposite.
+        # Links are ordered by (receiver, sender); sorted by (sender, receiver) they are
+        # opposite.
         return np.lexsort((self.receivers, self.senders))
 
     @cached_property
@@ -206,7 +208,7 @@ class Graph(FrozenModel):
         return np.bincount(self.senders, minlength=self.n_agents).astype(np.float64)
 
     @cached_property
-    def directed(self) -> bool:
+    def is_directed(self) -> bool:
         """Whether some link goes one way only."""
         # The same structure as the transpose's; both have sorted columns.
         transposed = self.links.T.tocsr()
@@ -223,8 +225,8 @@ class Graph(FrozenModel):
     def laplacian_spectrum(self) -> Array:
         """Eigenvalues of the Laplacian of an undirected graph, ascending, (A,).
 
-        All of them, by a dense solver: seconds at 2 000 agents. :attr:`max_stable_gain` needs only
-        the largest.
+        All of them, by a dense solver: seconds at 2 000 agents. :attr:`max_stable_gain`
+        needs only the largest.
         """
         self._check_undirected()
         eigenvalues = np.linalg.eigvalsh(self.laplacian.toarray())
@@ -236,13 +238,14 @@ class Graph(FrozenModel):
 
         With one-way links the eigenvalues are complex and it is the least
         :math:`2\operatorname{Re}\lambda/|\lambda|^2`, by a dense solver. Infinite without links.
-        It is :attr:`degree_bound_gain` where the largest eigenvalues lie too close together for
-        the iterative solver, as on a ring of very many agents.
+        It is :attr:`degree_bound_gain` where the largest eigenvalues lie too close
+        together for the iterative solver, as on a ring of very many agents.
         """
         if self.senders.size == 0:
             return float("inf")
-        if self.directed:
-            # |1 - γλ| < 1 if and only if γ < 2 Re λ / |λ|²; the zero eigenvalue is the average's.
+        if self.is_directed:
+            # |1 - γλ| < 1 if and only if γ < 2 Re λ / |λ|²; the zero eigenvalue is the
+            # average's.
             values = np.linalg.eigvals(self.laplacian.toarray())
             sizes = np.abs(values)
             moving = sizes > 1e-9 * sizes.max()
@@ -256,7 +259,8 @@ class Graph(FrozenModel):
         """Return 2/λ_max by Lanczos iterations, or the bound if they do not converge."""
         from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
-        # A fixed start makes results repeatable; a random one is orthogonal to no eigenvector.
+        # A fixed start makes results repeatable; a random one is orthogonal to no
+        # eigenvector.
         start = np.random.default_rng(0).standard_normal(self.n_agents)
         try:
             largest = eigsh(
@@ -276,14 +280,14 @@ class Graph(FrozenModel):
     def degree_bound_gain(self) -> float:
         """A gain from the degrees alone, at most :attr:`max_stable_gain`.
 
-        Agents can compute it by a maximum consensus. With links both ways it follows from the
-        largest sum of an agent's degree and its neighbours' mean degree
-        (R. Merris, Linear Algebra and its Applications 285 (1998) 33-35), exact for stars and even
-        rings; else by Gershgorin's discs.
+        Agents can compute it by a maximum consensus. With links both ways it follows
+        from the largest sum of an agent's degree and its neighbours' mean degree (R.
+        Merris, Linear Algebra and its Applications 285 (1998) 33-35), exact for stars
+        and even rings; else by Gershgorin's discs.
         """
         if self.senders.size == 0:
             return float("inf")
-        if self.directed:
+        if self.is_directed:
             # Gershgorin: every eigenvalue lies in a disc around d_i with radius d_i.
             return float(1 / self.in_degree.max())
         # λ_max <= max_i (d_i + m_i), with the mean degree m_i of agent i's neighbours.
@@ -299,7 +303,7 @@ class Graph(FrozenModel):
         return np.asarray(labels, dtype=np.int64)
 
     @property
-    def connected(self) -> bool:
+    def is_connected(self) -> bool:
         """Whether every agent can reach every other along the links."""
         # Components are numbered from 0.
         return int(self.components.max()) == 0
@@ -326,7 +330,7 @@ class Graph(FrozenModel):
 
     def _check_connected(self) -> None:
         """Refuse a graph of several components."""
-        if not self.connected:
+        if not self.is_connected:
             count = self.components.max() + 1
             raise ValueError(
                 f"graph must be (strongly) connected, got {count} components"
@@ -334,7 +338,7 @@ class Graph(FrozenModel):
 
     def _check_undirected(self) -> None:
         """Refuse one-way links."""
-        if self.directed:
+        if self.is_directed:
             raise ValueError("graph must have links both ways here, got one-way links")
 
 
@@ -346,11 +350,12 @@ def as_graph(
     Parameters
     ----------
     value : Graph, networkx graph, matrix or edges
-        A matrix of zeros and ones, an array or sparse, as in :meth:`Graph.from_adjacency`, or edges
-        as in :meth:`Graph.from_edges`, both with links both ways.
+        A matrix of zeros and ones, an array or sparse, as in
+        :meth:`Graph.from_adjacency`, or edges as in :meth:`Graph.from_edges`, both with
+        links both ways.
     n_agents : int, optional
-        The number of agents that it must have. Without it, edges have one more agent than the
-        largest number in them.
+        The number of agents that it must have. Without it, edges have one more agent
+        than the largest number in them.
     names : sequence of str
         Names of the agents, for a networkx graph: see :meth:`Graph.from_networkx`.
 
@@ -375,7 +380,7 @@ def as_graph(
     return graph
 
 
-def _undirected_graph(n_agents: int, first: Indices, second: Indices) -> Graph:
+def _link_both_ways(n_agents: int, first: Indices, second: Indices) -> Graph:
     """Return the graph with a link both ways between the agents of each pair."""
     one_way = np.stack([first.ravel(), second.ravel()], axis=1)
     both_ways = np.concatenate([one_way, one_way[:, ::-1]])
@@ -390,7 +395,7 @@ def path(agents: PositiveInt) -> Graph:
     (0, 2)
     """
     numbers = np.arange(agents)
-    return _undirected_graph(agents, numbers[:-1], numbers[1:])
+    return _link_both_ways(agents, numbers[:-1], numbers[1:])
 
 
 @validated
@@ -401,7 +406,7 @@ def ring(agents: Annotated[int, Bounds(at_least=3)]) -> Graph:
     (1, 3)
     """
     numbers = np.arange(agents)
-    return _undirected_graph(agents, numbers, np.roll(numbers, -1))
+    return _link_both_ways(agents, numbers, np.roll(numbers, -1))
 
 
 @validated
@@ -413,8 +418,9 @@ def star(agents: PositiveInt) -> Graph:
     >>> star(5).laplacian_spectrum.round(6) + 0.0
     array([0., 1., 1., 1., 5.])
     """
+    # Links between agent 0 and each of the others.
     others = np.arange(1, agents)
-    return _undirected_graph(agents, np.zeros_like(others), others)
+    return _link_both_ways(agents, np.zeros_like(others), others)
 
 
 @validated
@@ -428,7 +434,7 @@ def grid(rows: PositiveInt, columns: PositiveInt) -> Graph:
     # Each agent with its right neighbour, then each with the one below.
     first = np.concatenate([numbers[:, :-1].ravel(), numbers[:-1].ravel()])
     second = np.concatenate([numbers[:, 1:].ravel(), numbers[1:].ravel()])
-    return _undirected_graph(numbers.size, first, second)
+    return _link_both_ways(numbers.size, first, second)
 
 
 @validated
@@ -438,8 +444,9 @@ def complete(agents: PositiveInt) -> Graph:
     >>> complete(4).in_degree
     array([3., 3., 3., 3.])
     """
+    # Every pair once.
     first, second = np.triu_indices(agents, 1)
-    return _undirected_graph(agents, first, second)
+    return _link_both_ways(agents, first, second)
 
 
 @validated
@@ -454,7 +461,8 @@ def disk(
     positions : array_like, (A, p)
         Where the agents are.
     radius : float
-        The range, in the positions' unit, positive. Agents at exactly this distance have a link.
+        The range, in the positions' unit, positive. Agents at exactly this distance
+        have a link.
 
     Notes
     -----
@@ -467,10 +475,11 @@ def disk(
     """
     from scipy.spatial import cKDTree
 
+    # A k-d tree of no points does not exist.
     if positions.size == 0:
         raise ValueError(
             f"positions must have at least one agent, got shape {positions.shape}"
         )
     tree = cKDTree(positions)
     pairs = tree.query_pairs(radius, output_type="ndarray").astype(np.int64)
-    return _undirected_graph(len(positions), pairs[:, 0], pairs[:, 1])
+    return _link_both_ways(len(positions), pairs[:, 0], pairs[:, 1])

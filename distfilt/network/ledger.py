@@ -1,4 +1,4 @@
-"""The communication ledger, and what can be sent: numeric arrays, or flat tuples of them."""
+"""The communication ledger, and payloads: numeric arrays, or flat tuples of them."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ Payload = Part | tuple[Part, ...]
 class Ledger(FrozenModel):
     """Counts of all that the agents sent: the cost of a distributed method.
 
-    A message is one payload on one link, also if it is lost. A batch of independent runs counts
-    once: each run is a network of its own.
+    A message is one payload on one link, also if it is lost. A batch of independent
+    runs counts once: each run is a network of its own.
 
     Parameters
     ----------
@@ -41,7 +41,8 @@ class Ledger(FrozenModel):
     messages, scalars, bytes : ndarray of int, (A,)
         Sent by each agent, acknowledgements included.
     lost : ndarray, (A,)
-        Number of each agent's messages that did not arrive; the mean over a batch's runs.
+        Number of each agent's messages that did not arrive; the mean over a batch's
+        runs.
 
     Examples
     --------
@@ -78,19 +79,21 @@ def count_payload(
 ) -> tuple[list[Payload | None], Counts, Counts]:
     """Return read-only copies of the agents' payloads, and their scalars and bytes.
 
-    Entries that are NaN in all runs are not sent. A payload without any other entry is silence,
-    like None, and comes back as None.
+    Entries that are NaN in all runs are not sent. A payload without any other entry is
+    silence, like None, and comes back as None.
     """
     if not isinstance(payloads, Sequence | np.ndarray) or len(payloads) != agents:
-        got = len(payloads) if hasattr(payloads, "__len__") else type(payloads).__name__
+        size = len(payloads) if hasattr(payloads, "__len__") else None
+        received = type(payloads).__name__ if size is None else size
         raise InvalidArgumentError(
-            f"payloads must be a list with one entry for each of {agents} agents, got {got}"
+            f"payloads must be a list with one entry for each of {agents} agents, got {received}"
         )
     n_runs = math.prod(runs)
     sent: list[Payload | None] = [None] * agents
     scalars = [0] * agents
     bytes_ = [0] * agents
     for agent, payload in enumerate(payloads):
+        # None is silence, which costs nothing.
         if payload is None:
             continue
         is_tuple = type(payload) is tuple
@@ -99,6 +102,7 @@ def count_payload(
             raise ValueError(
                 f"payloads[{agent}] must have arrays, or None to stay silent, got ()"
             )
+        # Copied even if the payload turns out to be silence: the checks come with it.
         copies = [_copy_part(part, agent, runs) for part in parts]
         silent = True
         for part in copies:
@@ -117,10 +121,10 @@ def _copy_part(part: Any, agent: int, runs: tuple[int, ...]) -> Part:
     # A masked array's mask, or an object, could carry numbers that are not counted.
     plain = isinstance(part, np.ndarray) and not isinstance(part, np.ma.MaskedArray)
     if not plain or part.dtype.kind not in "biuf":
-        got = f"dtype {part.dtype}" if plain else type(part).__name__
+        name = f"dtype {part.dtype}" if plain else type(part).__name__
         raise InvalidArgumentError(
             f"payloads[{agent}] must be an array of real numbers, a flat tuple of them "
-            f"or None, got {got}"
+            f"or None, got {name}"
         )
     if part.shape[: len(runs)] != runs:
         raise ValueError(

@@ -30,7 +30,8 @@ class PIState(FrozenModel):
     Parameters
     ----------
     estimate, integral : ndarray, (*runs, A, k)
-        Each agent's estimate ν of the average input, and its integral η, which starts at zero.
+        Each agent's estimate ν of the average input, and its integral η, which starts
+        at zero.
 
     Examples
     --------
@@ -50,6 +51,7 @@ def pi_start(estimate: Annotated[Array, "... A k"]) -> PIState:
     >>> pi_start([[1.0], [3.0]]).estimate.shape
     (2, 1)
     """
+    # η starts at zero: the sum of the integrals, which never changes, must vanish.
     return PIState.construct(estimate.copy(), np.zeros_like(estimate))
 
 
@@ -61,8 +63,9 @@ def stable_substeps(
 
     An eigenvalue λ of the Laplacian contributes the matrix
     :math:`\begin{pmatrix}-\alpha-a\lambda & b\lambda\\ -b\lambda & 0\end{pmatrix}`. Its eigenvalues
-    μ have a negative real part, and a step h is stable when :math:`|1+h\mu|<1` for all. The
-    largest λ is at most twice the largest degree (Gershgorin), which agents can agree on.
+    μ have a negative real part, and a step h is stable when :math:`|1+h\mu|<1` for all.
+    The largest λ is at most twice the largest degree (Gershgorin), which agents can
+    agree on.
 
     Parameters
     ----------
@@ -74,8 +77,9 @@ def stable_substeps(
     Returns
     -------
     int
-        A number for which h = `dt` / number is at most half of a bound of stability. At the bound a
-        mode oscillates for ever, with half of it the fastest mode does not oscillate at all.
+        A number for which h = `dt` / number is at most half of a bound of stability. At
+        the bound a mode oscillates for ever, with half of it the fastest mode does not
+        oscillate at all.
 
     Examples
     --------
@@ -89,9 +93,9 @@ def stable_substeps(
     # Without links and with alpha = 0 nothing moves, and any step will do.
     damping = max(alpha + a * largest, 1e-300)
     coupling = b * largest
-    # μ² + (α + a λ) μ + b² λ² = 0. Real roots lie within [-damping, 0]. Complex ones, where
-    # 2 b λ > α + a λ, have the modulus b λ and the real part -(α + a λ)/2, and |1 + h μ| < 1 for
-    # h < (α + a λ) / (b λ)²; the largest λ is the worst.
+    # μ² + (α + a λ) μ + b² λ² = 0. Real roots lie within [-damping, 0]. Complex ones,
+    # where 2 b λ > α + a λ, have the modulus b λ and the real part -(α + a λ)/2, and |1
+    # + h μ| < 1 for h < (α + a λ) / (b λ)²; the largest λ is the worst.
     limit = 2 / damping
     if 2 * coupling > damping:
         limit = min(limit, damping / coupling**2)
@@ -118,20 +122,20 @@ def pi_step(
         + b\mathbf L^\top\boldsymbol\eta\;[+\dot{\mathbf u}],\qquad
         \dot{\boldsymbol\eta} = -b\mathbf L\boldsymbol\nu
 
-    Without the term in brackets, as printed, the average of the estimates is a low-pass filter of
-    the average input and lags behind a ramp of slope s by exactly s/α. With it the estimates follow
-    the average without a lag.
+    Without the term in brackets, as printed, the average of the estimates is a low-pass
+    filter of the average input and lags behind a ramp of slope s by exactly s/α. With
+    it the estimates follow the average without a lag.
 
     Parameters
     ----------
     state : PIState
         Not changed.
     inputs : array_like, (*runs, A, k)
-        The agents' inputs u at the beginning of the step. Within the step they change by `rate`,
-        or not at all.
+        The agents' inputs u at the beginning of the step. Within the step they change
+        by `rate`, or not at all.
     channel : Channel
-        Links both ways. Each substep is a round of 2k scalars a link. A link that loses a message
-        is not used in that round.
+        Links both ways. Each substep is a round of 2k scalars a link. A link that loses
+        a message is not used in that round.
     dt : float
         The step, in s.
     alpha, a, b : float
@@ -160,17 +164,20 @@ def pi_step(
     nu = state.estimate
     eta = state.integral
     slope: Array | float = 0.0 if rate is None else rate
+    # The derivative of the inputs, and the number of Euler steps.
     n = substeps or stable_substeps(channel, dt, alpha=alpha, a=a, b=b)
     h = dt / n
     k = inputs.shape[-1]
-    # One exchange of (ν, η): mixing with I - h L, less the values themselves, gives -h L of both.
+    # One exchange of (ν, η): mixing with I - h L, less the values themselves, gives -h
+    # L of both.
     weights = _laplacian_weights(channel.graph, h)
     for j in range(n):
-        both = np.concatenate([nu, eta], axis=-1)
-        change = channel.mix(both, weights) - both
+        pair = np.concatenate([nu, eta], axis=-1)
+        change = channel.mix(pair, weights) - pair
         proportional = change[..., :k]
         integral = change[..., k:]
-        # ν += h (α (u - ν) + u') - a h L ν + b h L η;  η -= b h L ν, with the old ν in both.
+        # ν += h (α (u - ν) + u') - a h L ν + b h L η;  η -= b h L ν, with the old ν in
+        # both.
         u = inputs + j * h * slope
         drift = alpha * (u - nu) + slope
         nu = nu + h * drift + a * proportional - b * integral

@@ -28,7 +28,8 @@ __all__ = [
 class UnstableGain(RuntimeWarning):
     """A gain above 2/λ_max, with which averaging diverges.
 
-    Turn it into an error, or off, by ``warnings.filterwarnings("error", category=UnstableGain)``.
+    Turn it into an error, or off, by ``warnings.filterwarnings("error",
+    category=UnstableGain)``.
 
     >>> issubclass(UnstableGain, RuntimeWarning)
     True
@@ -79,14 +80,15 @@ def stack_weights(
     graph : Graph
     self_weights, link_weights : ndarray, (R, A) and (R, E)
     received_offset : int
-        The matrix multiplies the runs' values, one below the other. With 0 the received values
-        are the same ones; delayed values stand so many rows below.
+        The matrix multiplies the runs' values, one below the other. With 0 the received
+        values are the same ones; delayed values stand so many rows below.
     """
     n_runs, n_agents = self_weights.shape
     row_starts = graph.links.indptr[:-1]
     run = np.arange(n_runs)[:, None]
-    # Every row of a run: the diagonal entry, then those of the links, ascending by sender. Sums
-    # are added in this order, which makes them those of a loop over messages to the bit.
+    # Every row of a run: the diagonal entry, then those of the links, ascending by
+    # sender. Sums are added in this order, which makes them those of a loop over
+    # messages to the bit.
     data = np.insert(link_weights, row_starts, self_weights, axis=1)
     diagonal = np.arange(n_agents) + n_agents * run
     received = graph.senders + n_agents * run + received_offset
@@ -122,11 +124,13 @@ def _with_unit_rows(graph: Graph, link_weights: Array) -> ConsensusWeights:
 def metropolis(graph: Graph) -> ConsensusWeights:
     r"""Metropolis weights :math:`w_{ij}=1/(1+\max(d_i,d_j))`: symmetric, rows sum to one.
 
-    Each agent needs only its neighbours' degrees. An agent without neighbours keeps its value.
+    Each agent needs only its neighbours' degrees. An agent without neighbours keeps its
+    value.
 
     Notes
     -----
-    L. Xiao, S. Boyd and S. Lall, Information Processing in Sensor Networks (2005) 63-70.
+    L. Xiao, S. Boyd and S. Lall, Information Processing in Sensor Networks (2005)
+    63-70.
 
     Examples
     --------
@@ -150,9 +154,10 @@ def _laplacian_weights(graph: Graph, gain: float) -> ConsensusWeights:
 def _warn_if_unstable(graph: Graph, gain: float) -> None:
     """Warn the user of a gain at which averaging on the graph diverges.
 
-    Most gains are below a bound from the degrees. Only above it eigenvalues are computed, once for
-    a graph.
+    Most gains are below a bound from the degrees. Only above it eigenvalues are
+    computed, once for a graph.
     """
+    # The cheap sufficient condition first.
     if gain <= graph.degree_bound_gain:
         return
     limit = graph.max_stable_gain
@@ -161,7 +166,8 @@ def _warn_if_unstable(graph: Graph, gain: float) -> None:
             f"gain must be at most 2/λ_max = {limit:.6g} of this graph for the agents to agree, "
             f"got {gain:.6g}",
             UnstableGain,
-            # From here over the consensus rule and its validation to the caller of the rule.
+            # From here over the consensus rule and its validation to the caller of the
+            # rule.
             stacklevel=4,
         )
 
@@ -200,8 +206,8 @@ def fastest_mixing(graph: Graph) -> ConsensusWeights:
     Fastest linear averaging on the graph: a convex problem, here smoothed by
     :math:`\mu\log\sum_k(e^{\lambda_k/\mu}+e^{-\lambda_k/\mu})` of the eigenvalues of
     :math:`\mathbf W-\mathbf 1\mathbf 1^\top\!/A` and solved by a quasi-Newton method for smaller
-    and smaller μ. Some weights may be negative. The matrices are dense: for up to a few hundred
-    agents, and somebody has to know the whole graph.
+    and smaller μ. Some weights may be negative. The matrices are dense: for up to a few
+    hundred agents, and somebody has to know the whole graph.
 
     Parameters
     ----------
@@ -228,6 +234,7 @@ def fastest_mixing(graph: Graph) -> ConsensusWeights:
     start = best_constant_edge(graph)
     # One variable for each pair of opposite links.
     forward = np.flatnonzero(graph.receivers < graph.senders)
+    # A single link leaves nothing to balance.
     if forward.size < 2:
         return start
     solutions = [start.link_weights[forward]]
@@ -293,15 +300,17 @@ def _smooth_modulus(
 def expected_gossip(graph: Graph) -> ConsensusWeights:
     """Return the expected weights of one round of :func:`distfilt.network.gossip_consensus`.
 
-    An agent wakes with probability 1 / A and averages with one of its neighbours. The second
-    largest eigenvalue bounds the factor by which the mean squared disagreement shrinks in a round.
+    An agent wakes with probability 1 / A and averages with one of its neighbours. The
+    second largest eigenvalue bounds the factor by which the mean squared disagreement
+    shrinks in a round.
 
     >>> from distfilt.network import graphs
     >>> expected_gossip(graphs.path(2)).self_weights
     array([0.5, 0.5])
     """
     graph._check_undirected()
-    # Agent i wakes and chooses j, or j wakes and chooses i; half of the difference moves.
+    # Agent i wakes and chooses j, or j wakes and chooses i; half of the difference
+    # moves.
     degree = np.maximum(graph.in_degree, 1)
     either = 1 / degree[graph.receivers] + 1 / degree[graph.senders]
     return _with_unit_rows(graph, either / (2 * graph.n_agents))
@@ -311,14 +320,15 @@ def expected_gossip(graph: Graph) -> ConsensusWeights:
 def column_stochastic(graph: Graph) -> ConsensusWeights:
     """Return weights with which each agent splits its value evenly: columns sum to one.
 
-    The parts go to itself and to all that receive from it. An agent needs to know only its
-    out-degree.
+    The parts go to itself and to all that receive from it. An agent needs to know only
+    its out-degree.
 
     >>> from distfilt.network import Graph
     >>> circle = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1)], directed=True)
     >>> column_stochastic(circle).self_weights
     array([0.5, 0.5, 0.5])
     """
+    # A sender's part is the same on all its links.
     part = 1 / (1 + graph.out_degree)
     return ConsensusWeights.construct(graph, part, part[graph.senders])
 
@@ -327,11 +337,11 @@ def column_stochastic(graph: Graph) -> ConsensusWeights:
 def doubly_stochastic(graph: Graph) -> ConsensusWeights:
     r"""Return weights of a strongly connected digraph whose rows and columns sum to one.
 
-    The links of agent i are scaled by entry i of the left null vector p of the Laplacian. The
-    columns of the scaled Laplacian then sum to zero as well,
+    The links of agent i are scaled by entry i of the left null vector p of the
+    Laplacian. The columns of the scaled Laplacian then sum to zero as well,
     :math:`\mathbf 1^\top\operatorname{diag}(\mathbf p)\mathbf L=\mathbf p^\top\mathbf L
-    =\mathbf 0`, so that averaging keeps the average on a digraph too. The vector depends on the
-    whole graph: agents compute it together once, or it is given to them.
+    =\mathbf 0`, so that averaging keeps the average on a digraph too. The vector
+    depends on the whole graph: agents compute it together once, or it is given to them.
 
     >>> from distfilt.network import Graph
     >>> circle = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1)], directed=True)
@@ -339,7 +349,7 @@ def doubly_stochastic(graph: Graph) -> ConsensusWeights:
     array([1., 1., 1.])
     """
     graph._check_connected()
-    if graph.directed:
+    if graph.is_directed:
         p = _left_null_vector(graph.laplacian)
     else:
         p = np.ones(graph.n_agents)
@@ -352,7 +362,8 @@ def _left_null_vector(laplacian: scipy.sparse.csr_array) -> Array:
     """Return the positive p with pᵀ L = 0 of a strongly connected graph, largest entry 1."""
     from scipy.sparse.linalg import splu
 
-    # With p_0 = 1 the other rows of Lᵀ p = 0 are an M-matrix's, which needs no pivoting.
+    # With p_0 = 1 the other rows of Lᵀ p = 0 are an M-matrix's, which needs no
+    # pivoting.
     transposed = laplacian.T.tocsc()
     matrix = transposed[1:, 1:]
     right = -transposed[1:, [0]].toarray().ravel()
@@ -372,7 +383,8 @@ def _left_null_vector(laplacian: scipy.sparse.csr_array) -> Array:
 def _check_keeps_average(weights: ConsensusWeights) -> None:
     """Refuse weights of which a column does not sum to one."""
     graph = weights.graph
-    # Not by the matrix: scipy's sums sort its entries in place, which changes how sums round.
+    # Not by the matrix: scipy's sums sort its entries in place, which changes how sums
+    # round.
     columns = weights.self_weights + np.bincount(
         graph.senders, weights.link_weights, graph.n_agents
     )

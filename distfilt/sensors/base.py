@@ -1,9 +1,10 @@
 """Sensors: the predicted observation, its noise, and the residual of two observations.
 
-An observation is missing where it is NaN: the component was not measured, or the sensor cannot
-see it from that state (the bearing of a place at which the sensor itself stands). A residual with
-such a component is NaN too, and a filter leaves it out of that run's update: a component is used
-only if the observation has it and so has every prediction that it is compared with.
+An observation is missing where it is NaN: the component was not measured, or the sensor
+cannot see it from that state (the bearing of a place at which the sensor itself
+stands). A residual with such a component is NaN too, and a filter leaves it out of that
+run's update: a component is used only if the observation has it and so has every
+prediction that it is compared with.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ def wrap(
     Parameters
     ----------
     angles : array_like, (...)
-        Angles, in rad. Those inside the interval are returned unchanged, and so is NaN (missing).
+        Angles, in rad. Those inside the interval are returned unchanged, and so is NaN
+        (missing).
     period : float
         2π for directions; π for the angle of a line, which `arctan(b/a)` measures.
 
@@ -58,7 +60,8 @@ def wrap(
     if inside.all():
         return np.array(angles)
     wrapped = (angles + half) % period - half
-    # Rounding can turn an angle just below -half into +half, which is the same direction.
+    # Rounding can turn an angle just below -half into +half, which is the same
+    # direction.
     wrapped = np.where(wrapped >= half, -half, wrapped)
     # The shift by half a period costs digits: angles inside keep all of theirs.
     return np.asarray(np.where(inside, angles, wrapped))
@@ -73,15 +76,16 @@ class Sensor(FrozenModel):
     dim : int
         Size m of an observation.
     h : callable
-        The observation function, ``h(x) -> y`` on (..., d) to (..., m), without noise; with
-        `uses_previous`, ``h(x, previous) -> y``. It gets copies of the states. NaN where the state
-        cannot be seen. A function that takes a single state only is refused when it first gets
-        several.
+        The observation function, ``h(x) -> y`` on (..., d) to (..., m), without noise;
+        with `uses_previous`, ``h(x, previous) -> y``. It gets copies of the states. NaN
+        where the state cannot be seen. A function that takes a single state only is
+        refused when it first gets several.
     noise_cov : array_like, (m, m)
         The covariance R of the noise, positive definite.
     residual_function : callable, optional
-        ``residual_function(observed, predicted)``, for observations that wrap; subtraction by
-        default. A function that decreases as the observation increases is refused.
+        ``residual_function(observed, predicted)``, for observations that wrap;
+        subtraction by default. A function that decreases as the observation increases
+        is refused.
     uses_previous : bool
         Whether the sensor measures a change since the previous observation time.
     kind : str
@@ -89,9 +93,9 @@ class Sensor(FrozenModel):
     linear : callable, optional
         ``linear(d) -> H``, (m, d), if h is linear.
     derivative : callable, optional
-        ``derivative(x)``, the Jacobian of h in the present state, (..., m, d), called like h.
-        Without it central differences are used. With it the two are compared once, and a warning
-        is given if they disagree.
+        ``derivative(x)``, the Jacobian of h in the present state, (..., m, d), called
+        like h. Without it central differences are used. With it the two are compared
+        once, and a warning is given if they disagree.
 
     Examples
     --------
@@ -115,7 +119,8 @@ class Sensor(FrozenModel):
         super().__post_init__()
         if self.residual_function is None:
             return
-        # The residual of 1 + 1e-6 and 1 is 1e-6, and -1e-6 if the arguments were exchanged.
+        # The residual of 1 + 1e-6 and 1 is 1e-6, and -1e-6 if the arguments were
+        # exchanged.
         one = np.ones(self.dim)
         residual = call_user(self.residual_function, one + 1e-6, one)
         if (np.asarray(residual) < -5e-7).any():
@@ -136,8 +141,8 @@ class Sensor(FrozenModel):
     ) -> Array:
         """Return the observation without noise of states (..., d), as (..., m).
 
-        `previous` holds the states at the previous observation time; only a sensor that measures
-        changes needs it.
+        `previous` holds the states at the previous observation time; only a sensor that
+        measures changes needs it.
         """
         return call_batched(self, "h", self._arguments(x, previous))
 
@@ -212,7 +217,8 @@ class Sensor(FrozenModel):
                 f"sensor must be linear to have a matrix H, got one of kind {self.kind!r}"
             )
         matrix = check_array(call_user(self.linear, dim), "linear", (self.dim, dim))
-        # A user's matrix is compared once with h, which maps the rows of I to those of Hᵀ.
+        # A user's matrix is compared once with h, which maps the rows of I to those of
+        # Hᵀ.
         if is_first_use(self, "linear"):
             predicted = self.predict(np.eye(dim))
             if not np.allclose(predicted, matrix.T, atol=1e-9):
@@ -229,8 +235,8 @@ class Sensor(FrozenModel):
     ) -> Array:
         """Return the derivative of h in the present states (..., d), as (..., m, d).
 
-        By `derivative` if the sensor has it, by central differences otherwise. NaN where the state
-        cannot be seen.
+        By `derivative` if the sensor has it, by central differences otherwise. NaN
+        where the state cannot be seen.
         """
         states = self._arguments(x, previous)
         d = x.shape[-1]
@@ -239,7 +245,8 @@ class Sensor(FrozenModel):
         if self.linear is not None:
             return np.broadcast_to(self.H(d), shape)
 
-        # The previous states stay fixed while the present one is varied along a new axis.
+        # The previous states stay fixed while the present one is varied along a new
+        # axis.
         fixed = [state[..., None, :] for state in states[1:]]
         predict = self.predict
 

@@ -121,7 +121,8 @@ def _pick(x: Array, indices: Sequence[int]) -> Array:
 
 def _selection_matrix(dim: int, indices: Sequence[int]) -> Array:
     """Return the rows of the identity that pick components."""
-    # The dimension of the state is known only now, and with it which indices are too large.
+    # The dimension of the state is known only now, and with it which indices are too
+    # large.
     Bounds(below=dim)(max(indices), "indices")
     return _pick(np.eye(dim), indices).T
 
@@ -154,7 +155,8 @@ def distance(
     std : float
         Standard deviation of the distance, in the components' unit, positive.
     origin : array_like, (n,), optional
-        The place of the sensor, one coordinate for each of the n indices; zero by default.
+        The place of the sensor, one coordinate for each of the n indices; zero by
+        default.
 
     Notes
     -----
@@ -196,8 +198,8 @@ def bearing(
 
     Notes
     -----
-    At the origin itself the angle does not exist: the prediction and its derivative are NaN, and a
-    filter leaves the observation out.
+    At the origin itself the angle does not exist: the prediction and its derivative are
+    NaN, and a filter leaves the observation out.
 
     See Also
     --------
@@ -220,8 +222,8 @@ def line_angle(
 ) -> Sensor:
     """Measure the angle of the line through two components (a, b), ``arctan(b/a)``, period π.
 
-    This is the angle of Grange et al., Table I. It is the same for a direction and the opposite
-    one; :func:`bearing` tells them apart.
+    This is the angle of Grange et al., Table I. It is the same for a direction and the
+    opposite one; :func:`bearing` tells them apart.
 
     Parameters
     ----------
@@ -234,8 +236,8 @@ def line_angle(
 
     Notes
     -----
-    At the origin itself the angle does not exist: the prediction and its derivative are NaN, and a
-    filter leaves the observation out.
+    At the origin itself the angle does not exist: the prediction and its derivative are
+    NaN, and a filter leaves the observation out.
 
     Examples
     --------
@@ -277,18 +279,19 @@ def range_bearing(
     indices : sequence of two int
         The components a and b.
     std : (float, float)
-        Standard deviations of the distance, in the components' unit, and of the angle, in rad.
+        Standard deviations of the distance, in the components' unit, and of the angle,
+        in rad.
     origin : array_like, (2,), optional
         The place of the sensor; zero by default.
     heading : float
-        The sensor's heading, in rad from the first axis to the second: the bearing is measured
-        from there, with period 2π.
+        The sensor's heading, in rad from the first axis to the second: the bearing is
+        measured from there, with period 2π.
 
     Notes
     -----
-    At the origin itself there is no angle: it and its derivative are NaN. A robot that moves needs
-    a new sensor at each observation; within :func:`distfilt.validation.skip_validation` making one
-    takes about 10 µs.
+    At the origin itself there is no angle: it and its derivative are NaN. A robot that
+    moves needs a new sensor at each observation; within
+    :func:`distfilt.validation.skip_validation` making one takes about 10 µs.
 
     Examples
     --------
@@ -358,7 +361,8 @@ def _direction(offset: Array, period: float, heading: float = 0.0) -> Array:
 
 
 def _angle_jacobian(x: Array, indices: Sequence[int], origin: Array) -> Array:
-    # ∂ arctan2(b, a) / ∂(a, b) = (-b, a) / (a² + b²); by unit vectors, so that no square overflows.
+    # ∂ arctan2(b, a) / ∂(a, b) = (-b, a) / (a² + b²); by unit vectors, so that no
+    # square overflows.
     offset = _offset(x, indices, origin)
     length = _norm(offset)
     length = np.where(length > 0, length, np.nan)
@@ -411,8 +415,9 @@ def angles_only(
     std : float
         Standard deviation of each angle, in rad, at most π.
     form : {"arctan2", "printed"}
-        Right ascension and declination, or (49) of Semeraro et al. as printed, which has the
-        arcsine of the unit vector's y component in place of the right ascension.
+        Right ascension and declination, or (49) of Semeraro et al. as printed, which
+        has the arcsine of the unit vector's y component in place of the right
+        ascension.
     observer : int
         Index at which the observer's position begins in the state.
     hidden : callable, optional
@@ -445,7 +450,8 @@ def _angles_only(
     sight = target - place
     # Rounding can bring a component of the unit vector above one, where arcsin is NaN.
     unit = np.clip(sight / np.linalg.norm(sight, axis=-1, keepdims=True), -1, 1)
-    # The declination is arcsin(z), the second angle of both forms; the printed first is arcsin(y).
+    # The declination is arcsin(z), the second angle of both forms; the printed first is
+    # arcsin(y).
     angles: Array = np.arcsin(unit[..., 1:])
     if form == "arctan2":
         angles[..., 0] = np.arctan2(unit[..., 1], unit[..., 0])
@@ -470,11 +476,11 @@ def from_name(
     Parameters
     ----------
     kind : {"component", "increment", "distance", "line_angle", "bearing"}
-        The function of this module that makes the sensor. The first four are the types of Grange
-        et al., Table I, there called direct, differential, range and angle.
+        The function of this module that makes the sensor. The first four are the types
+        of Grange et al., Table I, there called direct, differential, range and angle.
     indices, std
-        The components, counted from 0; the standard deviation of each, positive. Angles take two
-        components and at most π.
+        The components, counted from 0; the standard deviation of each, positive. Angles
+        take two components and at most π.
 
     Examples
     --------
@@ -488,7 +494,8 @@ def from_name(
         "line_angle": line_angle,
         "bearing": bearing,
     }
-    # The conditions of angles, which the annotations cannot state beside those of the others.
+    # The conditions of angles, which the annotations cannot state beside those of the
+    # others.
     if kind in ("line_angle", "bearing"):
         Bounds(at_most=np.pi)(std, "std")
         if len(indices) != 2:
@@ -502,8 +509,8 @@ def from_name(
 def stack(sensors: Sequence[Sensor]) -> Sensor:
     """Combine sensors into one, whose observation is theirs one after the other.
 
-    It wraps the components that the given sensors wrap, is linear if all of them are, and needs
-    the previous state if one of them does.
+    It wraps the components that the given sensors wrap, is linear if all of them are,
+    and needs the previous state if one of them does.
 
     Parameters
     ----------
@@ -521,7 +528,8 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
     # Independent noise: R is block diagonal.
     cov = block_diag(*[sensor.noise_cov for sensor in sensors])
     cov.setflags(write=False)
-    # Residuals are split only if some part wraps; plain subtraction does for the others.
+    # Residuals are split only if some part wraps; plain subtraction does for the
+    # others.
     residual_function = None
     if any(sensor.residual_function is not None for sensor in sensors):
         residual_function = partial(_stack_residuals, sensors=sensors)

@@ -80,9 +80,9 @@ class ConditionalMap(Protocol):
 @validated
 def compose(
     map_: ConditionalMap,
-    y: Annotated[ArrayInput, "... N map_.n_observed"],
-    x: Annotated[ArrayInput, "... N map_.dim"],
-    observed: Annotated[ArrayInput, "... map_.n_observed"],
+    y: ObservationSamples,
+    x: StateSamples,
+    observed: Annotated[ArrayInput, "... M"],
 ) -> Array:
     r"""Condition joint samples on an observation by the composed map (10) of Grange et al.
 
@@ -108,10 +108,22 @@ def compose(
     >>> compose(affine.fit(y, x), y, x, [2.0]).mean().round(1)
     np.float64(1.0)
     """
+    _check_sizes(map_, y, x)
     # The map may be the user's: its methods' own calls into the library are checked.
     reference = call_user(map_.__call__, y, x)
     members = call_user(map_.inverse, observed[..., None, :], reference)
     return np.asarray(members)
+
+
+def _check_sizes(map_: ConditionalMap, y: Array, x: Array) -> None:
+    """Raise an error if samples do not have the sizes of a map, where it has any."""
+    for name, samples, size_name in (("y", y, "n_observed"), ("x", x, "dim")):
+        size = getattr(map_, size_name, None)
+        n_columns = samples.shape[-1]
+        if size is not None and n_columns != size:
+            raise ValueError(
+                f"{name} must have {size} columns for this map, got {n_columns}"
+            )
 
 
 def _check_lower_triangular(value: Array, name: str) -> None:
@@ -311,7 +323,7 @@ def from_rows(coefficients: Array, observed_mean: Array) -> AffineMap:
     # S(y, x) = c + B y + A x with A = L⁻¹, so K = -L B and x̄ = K ȳ - L c.
     x_coefficients = coefficients[..., split:]
     solution = np.linalg.solve(x_coefficients, coefficients[..., :split])
-    gain = -solution[..., 1:]
+    gain = np.asarray(-solution[..., 1:], dtype=np.float64)
     mean = multiply_vector(gain, observed_mean) - solution[..., 0]
     identity = np.broadcast_to(np.eye(x_coefficients.shape[-1]), x_coefficients.shape)
     scale = np.linalg.solve(x_coefficients, identity)
@@ -321,8 +333,8 @@ def from_rows(coefficients: Array, observed_mean: Array) -> AffineMap:
 @validated
 def objective(
     map_: ConditionalMap,
-    y: Annotated[ArrayInput, "... N map_.n_observed"],
-    x: Annotated[ArrayInput, "... N map_.dim"],
+    y: ObservationSamples,
+    x: StateSamples,
 ) -> Array:
     """Return the objective (12) of the x-block, summed over its components, (...).
 
@@ -341,6 +353,7 @@ def objective(
     >>> float(objective(fit(np.empty((4, 0)), x), np.empty((4, 0)), x))
     0.5
     """
+    _check_sizes(map_, y, x)
     reference = call_user(map_.__call__, y, x)
     log_det = call_user(map_.log_det, y, x)
     # |S(y, x)|² / 2 - log det.

@@ -139,6 +139,7 @@ def has_tag(update: Update, tag: str) -> bool:
     >>> has_tag(print, "stacks")
     False
     """
+    # Options fixed by `partial` do not change the tags.
     function = update.func if isinstance(update, partial) else update
     return bool(getattr(function, tag, False))
 
@@ -168,6 +169,7 @@ def perturb_observations(
     centred or not.
     """
     normal = rng.standard_normal(predicted.shape)
+    # The members' mean is then not changed by the draws.
     if centred:
         normal -= normal.mean(axis=-2, keepdims=True)
     # zeta_i = L xi_i with R = L L'.
@@ -220,11 +222,14 @@ def with_missing(
     """
     lead = observed.shape[:-1]
     m = observed.shape[-1]
+    # The caller's generator advances by the same amount for any pattern.
     seed = _draw_seed(rng)
+    # numpy's own functions: these arrays are small, and the step stays in one module.
     if np.isfinite(observed).all() and np.isfinite(predicted).all():
         stream = _stream(rng, seed, m, lead)
         result = call_user(update, ensemble, predicted, observed, noise, rng=stream)
         return cast(Array, result)
+    # A component needs a value, and a prediction of every member.
     present = ~np.isnan(observed) & ~np.isnan(predicted).any(axis=-2)
     if has_tag(update, "accepts_missing"):
         marked = np.where(present, observed, np.nan)
@@ -256,12 +261,14 @@ def _update_by_pattern(
     if not one_noise:
         noise = np.broadcast_to(noise, (*lead, m, m)).reshape(-1, m, m)
     result = flat_ensemble.copy()
+    # One call for each set of components.
     for pattern in np.unique(flat_present, axis=0):
         columns = np.flatnonzero(pattern)
         # Without any observation the forecast is the analysis.
         if not columns.size:
             continue
         rows = np.flatnonzero((flat_present == pattern).all(axis=1))
+        # Rows and columns of the missing components are deleted from R.
         if one_noise:
             part = noise[np.ix_(columns, columns)]
         else:
@@ -292,6 +299,7 @@ def _stream(
     An ensemble's draws depend on its row and on its number of components, not on the components
     that others miss: each number has a stream of its own, drawn for all rows.
     """
+    # The number of components is part of the seed.
     words = np.array([*seed, m], dtype=np.uint32)
     bits = np.random.PCG64(np.random.SeedSequence(words))
     if isinstance(rng, RowGenerator):
@@ -336,7 +344,7 @@ class RowGenerator(Rng):
     def standard_normal(self, size: Any = None, *args: Any, **options: Any) -> Any:
         """Draw as numpy does, for the whole batch, and return the draws of the rows."""
         shape = tuple(size) if np.iterable(size) else ()
-        # Only draws with one entry a row can be told apart by row.
+        # Only draws with an entry for each row can be selected by row.
         if not self.is_partial or shape[:1] != self.rows.shape:
             return super().standard_normal(size, *args, **options)
         row_shape = shape[1:]

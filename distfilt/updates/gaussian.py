@@ -16,8 +16,8 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..ensembles import Ensemble, center_ensemble, exact_noise
-from ..linalg import cholesky, solve_definite
+from ..ensembles import Ensemble, exact_noise
+from ..linalg import center_ensemble, cholesky, solve_definite
 from ..models import Model
 from ..validation import Array, NonNegativeFloat, Rng, validated
 from .decorator import perturb_observations, update
@@ -35,7 +35,7 @@ ModelEnsemble = Annotated[Ensemble, "... n model.dim"]
 """At least two members with a model's number of components."""
 
 
-def _transposed_gain(
+def _solve_gain(
     anomalies: Array, predicted_anomalies: Array, noise: Array | float = 0.0
 ) -> Array:
     """Return the gain transposed, K' = (C_hh + R)⁻¹ C_hx, (..., m, d), by a solve."""
@@ -92,8 +92,9 @@ def enkf_sampled_covariance(
             f"ensemble must have at least {m + 1} members for {m} observations, got {n}"
         )
     perturbed = perturb_observations(predicted, noise, rng)
+    # Without R: it is in the sample covariance of the perturbed predictions.
     anomalies = center_ensemble(ensemble)[1]
-    gain = _transposed_gain(anomalies, center_ensemble(perturbed)[1])
+    gain = _solve_gain(anomalies, center_ensemble(perturbed)[1])
     # x_i + K (y* - y_i), as rows.
     innovations = observed[..., None, :] - perturbed
     return np.asarray(ensemble + innovations @ gain)
@@ -133,7 +134,7 @@ def enkf(
     """
     perturbed = perturb_observations(predicted, noise, rng, centred=centred)
     anomalies = center_ensemble(ensemble)[1]
-    gain = _transposed_gain(anomalies, center_ensemble(predicted)[1], noise)
+    gain = _solve_gain(anomalies, center_ensemble(predicted)[1], noise)
     # x_i + K (y* - y_i), in place.
     innovations = np.subtract(observed[..., None, :], perturbed, out=perturbed)
     analysis = innovations @ gain
@@ -169,9 +170,9 @@ def enkf_exact(
     anomalies = center_ensemble(ensemble)[1]
     predicted_anomalies = center_ensemble(predicted)[1]
     # Orthogonal to both, so that no sample covariance with the draws enters P+.
-    both = np.concatenate([anomalies, predicted_anomalies], axis=-1)
-    draws = exact_noise(both, cholesky(noise), rng)
-    gain = _transposed_gain(anomalies, predicted_anomalies, noise)
+    joint_anomalies = np.concatenate([anomalies, predicted_anomalies], axis=-1)
+    draws = exact_noise(joint_anomalies, cholesky(noise), rng)
+    gain = _solve_gain(anomalies, predicted_anomalies, noise)
     innovations = observed[..., None, :] - predicted - draws
     return np.asarray(ensemble + innovations @ gain)
 
@@ -217,7 +218,7 @@ def etkf(
     n = ensemble.shape[-2]
     mean, anomalies = center_ensemble(ensemble)
     predicted_mean, predicted_anomalies = center_ensemble(predicted)
-    gain = _transposed_gain(anomalies, predicted_anomalies, noise)
+    gain = _solve_gain(anomalies, predicted_anomalies, noise)
     # S = U D V', so (I + S S')^(-1/2) = I + U ((1 + D²)^(-1/2) - 1) U'.
     root = np.linalg.cholesky(noise)
     whitened = np.linalg.solve(root, predicted_anomalies.mT).mT / np.sqrt(n - 1)
@@ -227,6 +228,7 @@ def etkf(
     # Two centred members have one direction only.
     if rotation == "random" and n > 2:
         anomalies = _rotate_members(anomalies, rng)
+    # x̄ + K (y* - h̄).
     shift = (observed[..., None, :] - predicted_mean) @ gain
     return np.asarray(mean + shift + anomalies)
 
@@ -246,6 +248,7 @@ def _rotate_members(anomalies: Array, rng: Rng) -> Array:
     v[0] += 1
     v /= np.linalg.norm(v)
     reflected = anomalies - 2 * v[:, None] * (v @ anomalies)[..., None, :]
+    # The first coordinate, along the ones, stays.
     first = reflected[..., :1, :]
     rotated = reflected[..., 1:, :]
     for _ in range(3):

@@ -83,7 +83,7 @@ def warn_of_weights(
         warn_of_collapse(problem, "rejuvenation=")
         return
     m = observed.shape[-1]
-    largest = np.nanmax(_squared_distance(predicted, observed, noise), initial=0.0)
+    largest = np.nanmax(_mahalanobis_squared(predicted, observed, noise), initial=0.0)
     # It has a chi-squared distribution with mean m and variance 2 m: ten deviations.
     if largest > m + 10 * np.sqrt(2 * m):
         problem = (
@@ -93,7 +93,7 @@ def warn_of_weights(
         warn_of_collapse(problem, "rejuvenation=")
 
 
-def _squared_distance(predicted: Array, observed: Array, noise: Array) -> Array:
+def _mahalanobis_squared(predicted: Array, observed: Array, noise: Array) -> Array:
     """Return the squared Mahalanobis distance of each observation from its predictions, (...)."""
     mean = predicted.mean(axis=-2, keepdims=True)
     innovation = observed - mean[..., 0, :]
@@ -105,6 +105,7 @@ def _squared_distance(predicted: Array, observed: Array, noise: Array) -> Array:
 
 def repeat_by_count(points: Any, counts: Indices) -> Any:
     """Repeat the rows of points (..., N, d), each as often as its count (..., N), N in all."""
+    # Counts sum to N in every ensemble, so the repeated rows of a batch keep their places.
     rows = points.reshape(-1, points.shape[-1])
     return np.repeat(rows, counts.reshape(-1), axis=0).reshape(points.shape)
 
@@ -197,6 +198,7 @@ def jitter(
     >>> len(set(moved.ravel().tolist()))
     4
     """
+    # C = sum (x_i - x̄)(x_i - x̄)' / N.
     if cov is None:
         anomalies = points - points.mean(axis=-2, keepdims=True)
         cov = anomalies.mT @ anomalies / points.shape[-2]
@@ -238,6 +240,7 @@ def reweight(
 
     Raises an error if all likelihoods are zero.
     """
+    # log w_i + log p(y | x_i), and the logarithm of their sum.
     joint = log_weights + log_likelihood(predicted, observed, noise)
     total = log_sum_exp(joint)
     if not all_finite(total):

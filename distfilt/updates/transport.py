@@ -83,6 +83,7 @@ def transport_map_update(
     >>> posterior.mean().round(1), posterior.var().round(1)
     (np.float64(0.5), np.float64(0.5))
     """
+    # Joint samples: predictions with noise, and members.
     perturbed = _perturb(predicted, noise, noise_factor, rng)
     return _condition(fit, perturbed, ensemble, observed)
 
@@ -160,6 +161,7 @@ def principal_components(
     """
     perturbed = _perturb(predicted, noise, noise_factor, rng)
     Bounds(at_most=ensemble.shape[-1])(n_state, "n_state")
+    # An agent with few observations uses all of them.
     n_observed = min(n_observed, perturbed.shape[-1])
     observed_directions = principal_directions(perturbed, n_observed)
     directions = principal_directions(ensemble, n_state)
@@ -168,6 +170,7 @@ def principal_components(
     latent_predicted = perturbed @ observed_directions
     latent_observed = (observed[..., None, :] @ observed_directions)[..., 0, :]
     analysis = _condition(fit, latent_predicted, latent, latent_observed)
+    # Back to the state: W v alone, or x_i + W (v_i' - v_i) with the directions W.
     if complement == "literal":
         return np.asarray(analysis @ directions.mT)
     return np.asarray(ensemble + (analysis - latent) @ directions.mT)
@@ -230,6 +233,7 @@ def etpf(
     >>> posterior.mean().round(1), posterior.var().round(1)
     (np.float64(0.5), np.float64(0.5))
     """
+    # w_i ∝ p(y* | x_i), then members of equal weights by the optimal coupling.
     log_weights = log_likelihood(predicted, observed, noise)
     warn_of_weights(log_weights, predicted, observed, noise)
     analysis = coupling.transform_ensemble(ensemble, log_weights, correct=correct)

@@ -49,6 +49,7 @@ def _apply_after(update: Update, change: Callable[[Array], Array]) -> Update:
         rng: Rng,
         predict: Callable[[Array], Array] | None = None,
     ) -> Array:
+        # Only an update that repredicts takes a function `predict`.
         options: dict[str, Any] = {"rng": rng}
         if predict is not None:
             options["predict"] = predict
@@ -90,6 +91,7 @@ def with_inflation(
     """
 
     def inflate(analysis: Array) -> Array:
+        # x̄ + factor (x_i - x̄).
         mean = analysis.mean(axis=-2, keepdims=True)
         return np.asarray(mean + factor * (analysis - mean))
 
@@ -366,6 +368,7 @@ def gaspari_cohn(ratio: Array) -> Array:
     # (4.10): two polynomials of degree five, in Horner's form, that join smoothly at one.
     inside = 1 + r**2 * (-5 / 3 + r * (5 / 8 + r * (1 / 2 - r / 4)))
     outside = 4 + r * (-5 + r * (5 / 3 + r * (5 / 8 + r * (-1 / 2 + r / 12))))
+    # At zero the other polynomial is used.
     with np.errstate(divide="ignore"):
         outside = outside - 2 / (3 * r)
     return np.asarray(np.where(r <= 1, inside, np.where(r < 2, outside, 0.0)))
@@ -393,6 +396,7 @@ def _one_by_one(update: Update, taper: Array | None) -> Update:
         # Predictions that are not made again move along, as components d to d + m of the state.
         carries_predictions = predict is None
         for turn, group in enumerate(_group_correlated(noise)):
+            # The first group meets the filter's own predictions.
             if predict is not None and turn:
                 predicted = call_user(predict, ensemble)
             state = ensemble
@@ -410,6 +414,7 @@ def _one_by_one(update: Update, taper: Array | None) -> Update:
                 # x <- x + rho (x' - x); a group's component has its nearest observation's rho.
                 rho = taper[: state.shape[-1], group].max(axis=-1)
                 analysis = state + rho * (analysis - state)
+            # The next group starts from here.
             ensemble = analysis[..., :d]
             if carries_predictions:
                 predicted = analysis[..., d:]
@@ -439,6 +444,7 @@ def _group_correlated(noise: Array) -> list[Indices]:
 
     # Over a batch: observations that are correlated in any of its covariances stay together.
     correlated = (noise != 0).reshape(-1, *noise.shape[-2:]).any(axis=0)
+    # Groups are the connected components of the graph of correlations.
     graph = csr_array(correlated)
     labels = csgraph.connected_components(graph, directed=False)[1]
     return [np.flatnonzero(labels == label) for label in dict.fromkeys(labels.tolist())]

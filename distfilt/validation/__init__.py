@@ -6,7 +6,7 @@ it, the values that are allowed, and the value that came. Nothing is repaired. N
 checked again; :func:`skip_validation` does the same for a loop of your own.
 
 ======================================  ==========================================================
-Annotation                              Allowed values, and what the function gets
+Annotation                              Allowed values, and the function's value
 ======================================  ==========================================================
 ``Annotated[ArrayInput, "... N d"]``    finite real numbers of this shape, as a float64 array
 ``Annotated[ArrayInput, …, ALLOW_NAN]``  the same, where NaN stands for a missing number
@@ -96,10 +96,12 @@ __all__ = [
     "validated",
 ]
 
+# Arrays as inner functions and results have them.
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 Rng = np.random.Generator
 
+# Arguments that may be array_like: any value for a type checker, checked when a function is called.
 if TYPE_CHECKING:
     ArrayInput: TypeAlias = Any
     MaskInput: TypeAlias = Any
@@ -109,10 +111,12 @@ else:
     MaskInput = Mask
     IndicesInput = Indices
 
+# Arrays with rules; a shape in a further Annotated replaces the one given here.
 PositiveDefinite = Annotated[ArrayInput, "... d d", check_positive_definite]
 PositiveSemidefinite = Annotated[ArrayInput, "... d d", check_positive_semidefinite]
 Probabilities = Annotated[ArrayInput, "... N", check_probabilities]
 Times = Annotated[ArrayInput, "T", check_increasing]
+# Numbers in bounds.
 PositiveFloat = Annotated[float, Bounds(above=0)]
 NonNegativeFloat = Annotated[float, Bounds(at_least=0)]
 UnitInterval = Annotated[float, Bounds(at_least=0, at_most=1)]

@@ -22,8 +22,8 @@ from .checks import (
 
 __all__ = ["ALLOW_NAN", "CallContext", "Constraint", "make_constraint"]
 
+# Beside an array's shape: NaN may stand for a missing number; infinity may not.
 ALLOW_NAN = "missing allowed"
-"""Beside an array's shape: NaN may stand for a missing number; infinity may not."""
 
 
 @dataclass(slots=True)
@@ -36,8 +36,10 @@ class CallContext:
     def bind_shape(self, shape: tuple[int, ...], expected: ShapeNames) -> bool:
         """Whether a shape is as declared; if so the free names are bound to its sizes."""
         names = expected.names
+        # As a rule no name refers to an argument, and all are free.
         if not expected.references.isdisjoint(self.arguments):
             names = self.resolve(names)
+        # A copy, since a shape that does not match must bind nothing.
         dimensions = self.dimensions.copy()
         matches = match_shape(shape, names, dimensions)
         if matches:
@@ -49,6 +51,7 @@ class CallContext:
         shape: list[Any] = []
         for name in names:
             size = self._size(name) if isinstance(name, str) else name
+            # A tuple stands for several axes, such as the axes of runs.
             if type(size) is tuple:
                 shape.extend(size)
             else:
@@ -74,8 +77,8 @@ class ShapeNames:
     """The dimensions of a declared shape."""
 
     names: tuple[Any, ...]
+    # The first part of each name, which may be an argument of the call.
     references: frozenset[str]
-    """The first part of each name, which may be an argument of the call."""
 
     @classmethod
     def parse(cls, words: Sequence[str]) -> ShapeNames:
@@ -120,6 +123,7 @@ class Constraint:
 
 
 def _convert_float(value: Any, name: str, context: CallContext) -> float:
+    # These types need no array; all others go through its conversion, which refuses most.
     number = value
     if type(value) not in (float, int, np.float64):
         try:
@@ -200,6 +204,7 @@ def _convert_array(
             )
     else:
         array = np.asarray(value)
+        # Signed or unsigned integers; a float array of whole numbers is none of them.
         dtype_kinds = "b" if dtype is np.bool_ else "iu"
         is_masked = isinstance(value, np.ma.MaskedArray)
         if array.dtype.kind not in dtype_kinds or is_masked:
@@ -304,6 +309,7 @@ def make_constraint(annotation: Any) -> Constraint | None:
     if annotation is Any or annotation == ArrayLike:
         return None
     annotation = _resolve_alias(annotation)
+    # Annotated[X, ...] has the origin Annotated, Sequence[X] the origin Sequence.
     origin = get_origin(annotation)
     args = get_args(annotation)
     if origin is Annotated:
@@ -317,6 +323,7 @@ def make_constraint(annotation: Any) -> Constraint | None:
         return _make_array(annotation)
     if origin in _SEQUENCES:
         return _make_sequence(origin, args)
+    # Of a generic class only instances are checked, not its parameters.
     cls = origin or annotation
     if cls in _PLAIN_TYPES or not isinstance(cls, type):
         return _PLAIN_TYPES.get(cls)
@@ -326,6 +333,7 @@ def make_constraint(annotation: Any) -> Constraint | None:
 
 def _make_sequence(origin: Any, args: tuple[Any, ...]) -> Constraint:
     """Return the constraint of a sequence of any length, or of a tuple of a fixed one."""
+    # tuple[X, Y] has a fixed length, tuple[X, ...] any.
     if origin is tuple and args[-1] is not ...:
         constraints = tuple([make_constraint(arg) for arg in args])
         description = f"a tuple of {_describe(constraints, ', ')}"
@@ -344,6 +352,7 @@ def _make_union(args: tuple[Any, ...]) -> Constraint | None:
         if arg is type(None):
             continue
         constraint = make_constraint(arg)
+        # If one alternative allows any value, so does the union.
         if constraint is None:
             return None
         alternatives.append(constraint)
@@ -369,6 +378,7 @@ def _make_annotated(base: Any, metadata: tuple[Any, ...]) -> Constraint | None:
         constraint = make_constraint(base)
     if constraint is None:
         return None
+    # Rules come after those of the alias that is annotated further.
     rules = tuple([note for note in metadata if callable(note)])
     return replace(constraint, rules=constraint.rules + rules)
 
@@ -377,6 +387,7 @@ def _make_array(
     base: Any, words: Sequence[str] | None = None, allow_nan: bool = False
 ) -> Constraint:
     """Return the constraint of an array, of any shape if there are no words for it."""
+    # NDArray[X] is ndarray[shape, dtype[X]].
     dtype = get_args(get_args(base)[1])[0]
     entries = {np.float64: "real numbers", np.bool_: "True and False"}
     description = f"an array of {entries.get(dtype, 'integers')}"

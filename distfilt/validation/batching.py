@@ -13,8 +13,8 @@ from .first_use import mark_checked, needs_check
 
 __all__ = ["call_batched"]
 
+# Largest difference between batched and single results, relative to the state's change.
 _RELATIVE_TOLERANCE = 1e-2
-"""Largest difference between batched and single results, relative to the state's change."""
 
 
 def call_batched(owner: Any, name: str, states: Sequence[Array], *args: float) -> Array:
@@ -60,6 +60,7 @@ def call_batched(owner: Any, name: str, states: Sequence[Array], *args: float) -
     ValueError: flow must take many states at once, ...
     """
     function = getattr(owner, name)
+    # The first argument is the present state; another may be the previous one.
     x = states[0]
     result = _call_or_catch(function, states, args)
     expected = (*x.shape[:-1], owner.dim)
@@ -72,6 +73,7 @@ def call_batched(owner: Any, name: str, states: Sequence[Array], *args: float) -
             mark_checked(owner, check)
     if has_shape:
         return np.asarray(result)
+    # An index beyond the last component: the state is too short for the function.
     if isinstance(result, IndexError):
         raise ValueError(f"x must have more components, got {x.shape}") from result
     if isinstance(result, Exception):

@@ -45,9 +45,10 @@ class InvalidArgumentError(ValueError, TypeError):
 
 InvalidArgumentError.__module__ = "distfilt.validation"
 
+# Largest asymmetry or negative eigenvalue that counts as rounding, relative to the variances.
 _ROUNDING = 1e-9
-"""Largest asymmetry or negative eigenvalue that counts as rounding, relative to the variances."""
 
+# Types that numpy would convert to numbers inside a list or an array of objects.
 _NOT_REAL = (
     bool,
     np.bool_,
@@ -60,7 +61,6 @@ _NOT_REAL = (
     type(None),
     np.ma.MaskedArray,
 )
-"""Types that numpy would convert to numbers inside a list or an array of objects."""
 
 
 def type_name(value: object) -> str:
@@ -141,11 +141,14 @@ def _convert_to_float64(value: Any, name: str) -> Array:
     """Convert a value that holds real numbers and nothing else."""
     wrong_type = type_name(value)
     try:
+        # The entries of a list are checked before numpy converts them to a common type.
         parts = value if isinstance(value, list | tuple) else (value,)
         array = np.asarray(value)
+        # An array of objects may hold numbers, and anything else.
         entries: Any = array.ravel() if array.dtype.kind == "O" else ()
         if len(entries):
             wrong_type = type_name(entries[0])
+        # Booleans, text and dates would be converted to numbers without an error.
         refused = [v for v in (*parts, *entries) if isinstance(v, _NOT_REAL)]
         if refused:
             wrong_type = type_name(refused[0])
@@ -254,12 +257,13 @@ def _has_cholesky(value: Array) -> bool:
 
 def _smallest_eigenvalues(value: Array) -> Array:
     """Smallest eigenvalues of covariances that are scaled to unit variances."""
-    eigenvalues: Array = np.linalg.eigvalsh(_to_unit_variances(value))
-    return eigenvalues[..., 0]
+    eigenvalues = np.linalg.eigvalsh(_to_unit_variances(value))
+    return np.asarray(eigenvalues[..., 0], dtype=np.float64)
 
 
 def _raise_not_positive(value: Array, name: str, smallest: Array, kind: str) -> None:
     """Raise the error that gives the worst matrix's smallest eigenvalue and its index."""
+    # The first matrix of the stack with the smallest eigenvalue, which is given in its own units.
     index = tuple(np.argwhere(smallest == smallest.min())[0].tolist())
     eigenvalue = np.linalg.eigvalsh(value[index])[0]
     place = f" at {list(index)}" if index else ""
@@ -288,6 +292,7 @@ def check_probabilities(value: Array, name: str) -> None:
     Traceback (most recent call last):
     ValueError: weights must sum to 1, got 1.1
     """
+    # An empty array has no minimum.
     if value.size and value.min() < 0:
         raise ValueError(f"{name} must be nonnegative weights, got {value.min():.6g}")
     total = np.ravel(value.sum(axis=-1))
@@ -352,6 +357,7 @@ class Bounds:
             if bound is None:
                 continue
             inside = compare(value, bound)
+            # A single number is compared without numpy, which is faster.
             if inside is True or np.all(inside):
                 continue
             outside = value if np.ndim(value) == 0 else value[~inside].flat[0]

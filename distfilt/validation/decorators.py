@@ -64,6 +64,7 @@ class SignatureConstraints:
         if len(arguments) < len(args) + len(options):
             # Too many arguments, or one of them twice: Python's own error says which.
             signature(self.function).bind(*args, **options)
+        # Shapes may refer to defaults too, which are not checked.
         context = CallContext(self.defaults | arguments)
         for name, constraint in self.constraints.items():
             if name in arguments:
@@ -73,6 +74,7 @@ class SignatureConstraints:
                     # The most frequent case, a time, needs no conversion.
                     continue
                 value = constraint.validate(value, name, context)
+                # Later shapes refer to the converted value.
                 arguments[name] = value
                 context.arguments[name] = value
         return arguments
@@ -152,6 +154,7 @@ def validated(
 
     @wraps(function)
     def wrapper(*args: Any, **options: Any) -> Any:
+        # Arguments of a nested call come from the library.
         if _NESTED.get():
             return function(*args, **options)
         arguments = constraints.validate(args, options)
@@ -196,10 +199,11 @@ def call_user(function: Callable[..., Any], *args: Any, **options: Any) -> Any:
     >>> call_user(max, 1, 2)
     2
     """
-    inner = function
-    while isinstance(inner, partial):
-        inner = inner.func
-    module = getattr(inner, "__module__", None) or ""
+    # A partial has no module; its innermost function does.
+    unwrapped = function
+    while isinstance(unwrapped, partial):
+        unwrapped = unwrapped.func
+    module = getattr(unwrapped, "__module__", None) or ""
     if module.startswith("distfilt."):
         return function(*args, **options)
     token = _NESTED.set(False)

@@ -11,8 +11,8 @@ from typing import Any
 
 __all__ = ["is_first_use", "mark_checked", "needs_check"]
 
+# Names of the checks that have been made, by the owner's id, as long as the owner lives.
 _CHECKED: dict[int, set[str]] = {}
-"""Names of the checks that have been made, by the owner's id, as long as the owner lives."""
 
 
 def needs_check(owner: Any, check: str) -> bool:

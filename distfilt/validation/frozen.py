@@ -41,15 +41,18 @@ class FrozenModel:
     def __post_init__(self) -> None:
         cls: Any = type(self)
         context = CallContext(dict(vars(self)))
+        # Shapes refer to fields by name, as they do to arguments in a call.
         values = context.arguments
         for name, constraint in field_constraints(cls).items():
             value = constraint.validate(values[name], name, context)
             values[name] = _freeze(value)
+        # A frozen dataclass has no __setattr__; its dictionary takes the converted values.
         vars(self).update(values, is_validated=True)
 
     @classmethod
     def construct(cls, *args: Any, **options: Any) -> Self:
         """Build an instance of values that the library made: nothing is checked or copied."""
+        # Past __init__, and so past the checks.
         instance = object.__new__(cls)
         dataclass: Any = cls
         names, factories = _fields(dataclass)
@@ -90,6 +93,7 @@ def field_constraints(cls: Any) -> dict[str, Constraint]:
     """Return the constraints of a dataclass's fields, inherited ones included, arrays last."""
     names, _ = _fields(cls)
     constraints: dict[str, Constraint] = {}
+    # Base classes first, so that a subclass may narrow the annotation of a field.
     for base in reversed(cls.__mro__):
         annotations = get_annotations(base)
         declared = {name: annotations[name] for name in annotations if name in names}
@@ -106,6 +110,7 @@ def _freeze(value: Any) -> Any:
         return tuple([_freeze(entry) for entry in value])
     if not isinstance(value, np.ndarray):
         return value
+    # The caller may change its own array later.
     copy = value.copy()
     copy.setflags(write=False)
     return copy

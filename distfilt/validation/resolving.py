@@ -42,6 +42,7 @@ def make_constraints(
     for argument, annotation in annotations.items():
         if argument == "return":
             continue
+        # With ``from __future__ import annotations`` all of them are strings.
         if isinstance(annotation, str):
             annotation = _evaluate(annotation, module, names, f"{argument} of {owner}")
         constraint = make_constraint(annotation)
@@ -83,6 +84,7 @@ def _type_checking_imports(module: str) -> dict[str, Any]:
     for node in tree.body:
         if isinstance(node, ast.If) and _is_type_checking(node.test):
             statements = [s for s in node.body if isinstance(s, _IMPORTS)]
+            # Only imports are run, no other statement of the block.
             block = ast.Module(body=list(statements), type_ignores=[])
             exec(compile(block, module, "exec"), names)
     return names

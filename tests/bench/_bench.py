@@ -1,8 +1,9 @@
-"""What every benchmark shares: repeated timing, and tables that say where they were measured.
+"""Parts of all benchmarks: repeated timing, and tables that record where they were measured.
 
-A script yields the rows of its tables; a row whose floor or limit is not met says so by a number
-``missed``. `main` shows the tables and writes each unless others kept the machine busy meanwhile;
-``--force`` writes it all the same. It ends with the number of what was missed.
+A script yields the rows of its tables; ``missed`` in a row counts its missed floors and
+limits. `main` prints the tables and writes each, unless other processes kept the
+machine busy; ``--force`` writes them anyway. The exit code is the number of missed
+floors and limits.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ def measure_time(function: Callable[[], Any], repeats: int = 3) -> Timing:
     """
     cpu = []
     result = None
-    # Waiting BLAS threads count as processor time and would hide what small matrices cost.
+    # Waiting BLAS threads count as processor time and would hide the cost of small matrices.
     with threadpool_limits(limits=1):
         for _ in range(repeats):
             start = time.process_time()
@@ -61,9 +62,9 @@ def compare_times(
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Processor time in s of a call of each, and the first one's speed as a multiple of each.
 
-    After a warm-up the functions take turns, so that what disturbs one disturbs all: medians over
-    the rounds, of the times and of the ratios within a round. A turn is as many calls as take
-    `seconds`.
+    After a warm-up the functions take turns, so that a disturbance meets all of them:
+    medians over the rounds, of the times and of the ratios within a round. A turn is as
+    many calls as take `seconds`.
     """
     times: dict[str, list[float]] = {name: [] for name in functions}
     with threadpool_limits(limits=1):
@@ -88,7 +89,7 @@ def compare_times(
 
 
 def peer(name: str) -> Any:
-    """A module of another package (the extra ``peers``), or None with a word that it is missing."""
+    """Import a module of another package (the extra ``peers``); None if it is missing."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -103,18 +104,18 @@ def peak_mb() -> float:
 
 
 def busy_cores(seconds: float = 1.0) -> float:
-    """How many cores others keep busy, while this process waits."""
+    """Return how many cores other processes keep busy, while this one waits."""
     return (os.cpu_count() or 1) * psutil.cpu_percent(seconds) / 100
 
 
 _BUSY_AT_START = busy_cores()
-"""Taken when the script begins; `write` looks again."""
+"""Measured when the script begins; `write` measures again."""
 BUSY = 1.0
-"""Times that were taken under more load are shown and not kept."""
+"""Times measured under a higher load are printed and not written."""
 
 
 def machine(busy: float) -> str:
-    """Processor, core count, and how busy others kept it; `timed` holds BLAS to one thread."""
+    """Return processor, core count and load; `measure_time` limits BLAS to one thread."""
     name = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():

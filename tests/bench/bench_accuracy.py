@@ -1,12 +1,12 @@
 """Errors on DAPPER's own Lorenz-63 problem, beside those of its own filters, tuned as it says.
 
-Truths and readings are DAPPER's (Sakov et al. 2012: three components seen every 25 steps of 0.01),
-and both get the same. Ours are parts as they are shipped, with the same members and inflation. The
-error is the root mean square over components, its mean over the times after the burn-in, and over
-independent runs. A track is lost where it was ever above four deviations of a reading, for good or
-for a while; such runs are counted, and left out of all but `ratio_of_all`. Misses where the ratio
-is above its limit by more than two standard errors of the paired difference, or tracks are lost
-more often by as many.
+Truths and observations are DAPPER's (Sakov et al. 2012: three components seen every 25
+steps of 0.01), and both libraries get the same. Ours have the same members and
+inflation. The error is the root mean square over components, its mean over the times
+after the burn-in, and over independent runs. A track is lost if its error ever exceeds
+four standard deviations of an observation; such runs are counted, and left out of all
+columns but `ratio_of_all`. Misses where the ratio is above its limit by more than two
+standard errors of the paired difference, or tracks are lost more often by as many.
 """
 
 from __future__ import annotations
@@ -66,6 +66,7 @@ def errors() -> Iterator[Row]:
     truth = np.stack([x[hmm.tseq.kko] for x, _ in draws], axis=1)
     seen = np.stack([np.array([*y]) for _, y in draws], axis=1)
 
+    # Root mean square over components after the burn-in, (T, runs)
     def error(means: Any) -> Any:
         gap = (np.asarray(means) - truth)[times > hmm.tseq.BurnIn]
         return np.sqrt((gap**2).mean(axis=-1))

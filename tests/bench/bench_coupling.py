@@ -1,8 +1,9 @@
 """Couplings: the network simplex beside a general solver, and beside the entropic one.
 
-Misses where cvxpy is less than thirty times slower, or finds another value. cvxpy runs as
-equations (4) and (5) are written down, built anew for every reading as a filter would. It gets no
-more than 200 members: its matrices have 2 N^3 entries. The slope is that of the simplex's time.
+Misses where cvxpy is less than thirty times slower, or finds another value. cvxpy runs
+as equations (4) and (5) are written down, built anew for every observation as a filter
+would. It gets no more than 200 members: its matrices have 2 N^3 entries. The slope is
+that of the simplex's time.
 """
 
 from __future__ import annotations

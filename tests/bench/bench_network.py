@@ -1,10 +1,11 @@
 """Filters on many agents, and operations on very many.
 
-A thousand agents with about six neighbours each and a dozen kinds of sensors, d = 6, with
-covariance intersection by every rule: at most 0.12 s a step; ten thousand, by the dearest rule: at
-most 1 s. A hundred thousand agents: `combine`, `max_stable_gain` and `balanced` with links one way, at
-most 1 s each in a process of its own that never needs more than 500 MB, graph and packages
-included. Importing the filters takes at most 1.3 times as long as importing scipy.linalg.
+A thousand agents with about six neighbours each and a dozen kinds of sensors, d = 6,
+with covariance intersection by every rule: at most 0.12 s a step; ten thousand, by the
+most expensive rule: at most 1 s. A hundred thousand agents: `Channel.mix`,
+`max_stable_gain` and `doubly_stochastic` on a directed graph, at most 1 s each in a
+process of its own that needs at most 500 MB, graph and packages included. Importing the
+filters takes at most 1.3 times as long as importing scipy.linalg.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ MEGABYTES = 500.0
 
 
 def spread(agents: int, neighbours: float = 10) -> tuple[np.ndarray, float]:
-    """Places in the unit square, and a range that gives about so many neighbours."""
+    """Return positions in the unit square, and a range that gives about that many neighbours."""
     places = np.random.default_rng(agents).random((agents, 2))
     return places, float(np.sqrt(neighbours / np.pi / agents))
 
@@ -104,7 +105,7 @@ def many() -> Iterator[Row]:
 
 
 def import_times(*names: str) -> list[float]:
-    """How long a process takes that imports one of these, in s: medians of fifteen, in turns."""
+    """Return the time of a process that imports each module, in s: medians of fifteen, in turns."""
     taken: dict[str, list[float]] = {name: [] for name in names}
     for name in names * 15:
         began = time.perf_counter()
@@ -114,7 +115,7 @@ def import_times(*names: str) -> list[float]:
 
 
 def one_way() -> Graph:
-    """Very many agents in the plane, each with a range of its own: not all hear who hears them."""
+    """Return a directed graph of very many agents in the plane, each with a range of its own."""
     rng = np.random.default_rng(3)
     places = rng.random((VERY_MANY, 2))
     reach = np.sqrt(rng.uniform(8, 16, VERY_MANY) / np.pi / VERY_MANY)
@@ -129,11 +130,11 @@ def one_way() -> Graph:
 
 
 def measure_operation(operation: str) -> tuple[int, Any]:
-    """Agents, and what one operation on very many of them takes."""
+    """Return the number of agents, and the time and memory of one operation on them."""
     graph = one_way() if operation == "balanced" else graphs.disk(*spread(VERY_MANY))
     averaging = (
         weights.column_stochastic(graph)
-        if graph.directed
+        if graph.is_directed
         else weights.metropolis(graph)
     )
     values = np.random.default_rng(4).standard_normal((VERY_MANY, 6))

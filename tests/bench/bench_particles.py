@@ -1,9 +1,9 @@
 """The bootstrap particle filter against the `particles` package.
 
-A random walk in three components, of which two are seen with a full noise; 50 steps with a thousand
-to a hundred thousand particles, resampled in every step by the systematic rule, and the weighted
-mean of each. Beside the times: its error against the Kalman filter, in units of the standard
-deviation. Misses where the package is faster.
+A random walk in three components, of which two are seen with a full noise; 50 steps
+with a thousand to a hundred thousand particles, resampled in every step by the
+systematic rule, and the weighted mean of each. Beside the times: its error against the
+Kalman filter, in units of the standard deviation. Misses where the package is faster.
 """
 
 from __future__ import annotations

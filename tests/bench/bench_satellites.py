@@ -1,11 +1,12 @@
 """A step of the filter of Table III of Grange et al.
 
-The network has five agents, 13 components and 200 members; known noise and covariance intersection,
-or exact draws and moments. A step is held against the same mathematics by numpy, with nothing
-checked, no message charged and no reading lost: the model's motion, what the sensors would read,
-the draws, which are projected where they are exact, the gains, the fusion of moments and the map
-that moves members least to them. The search for the weights of least determinant, which the second
-filter makes, is the library's own in both. Misses above the limits.
+The network has five agents, 13 components and 200 members; known noise and covariance
+intersection, or exact draws and moments. A step is compared with the same mathematics
+in plain numpy, without checks, a ledger or losses: the model's motion, the sensors'
+predictions, the draws, projected where they are exact, the gains, the fusion of moments
+and the map that moves members least to them. The search for the weights of least
+determinant, which the second filter makes, is the library's own in both. Misses above
+the limits.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def anomalies(x: np.ndarray) -> np.ndarray:
 
 def exact_draws(z: np.ndarray, avoid: np.ndarray) -> np.ndarray:
     """Normal draws (..., N, k) made uncorrelated with anomalies and of unit sample covariance."""
-    # What a linear sensor reads depends on the members: no system of normal equations.
+    # A linear sensor's predictions depend on the members, so that normal equations are singular.
     frame = np.linalg.qr(avoid)[0]
     z = anomalies(z)
     z -= frame @ (frame.mT @ z)
@@ -59,7 +60,7 @@ def plain_step(
     ]
 
     def predict(k: int, x: np.ndarray, before: np.ndarray) -> np.ndarray:
-        """What the sensors that agent k hears would read of its members, without noise."""
+        """Return the predictions of the sensors that agent k receives, without noise."""
         return np.concatenate(
             [
                 s.h(x, before) if s.uses_previous else s.h(x)
@@ -80,6 +81,7 @@ def plain_step(
             a = anomalies(x[:, k])
             b = anomalies(h)
             m = h.shape[-1]
+            # K = (BᵀB / (N - 1) + I)⁻¹ BᵀA / (N - 1); predictions are in units of the noise
             gain = np.linalg.solve(b.mT @ b / n + np.eye(m), b.mT @ a / n)
             x[:, k] -= (h + draw(np.concatenate([a, b], axis=-1), m)) @ gain
         a = anomalies(x)
@@ -96,9 +98,11 @@ def plain_step(
         else:
             weights = receives / np.trace(covs, axis1=-2, axis2=-1)[:, None]
             weights /= weights.sum(axis=-1, keepdims=True)
+        # Covariance intersection: P⁻¹ = Σ w P_j⁻¹
         fused = np.linalg.inv(np.einsum("rkj,rjde->rkde", weights, precise))
         sent = (precise @ x.mean(axis=-2)[..., None])[..., 0]
         mean = (fused @ (weights @ sent)[..., None])[..., 0]
+        # The optimal transport map between the Gaussians before and after
         lower = np.linalg.cholesky(covs)
         values, vectors = np.linalg.eigh(lower.mT @ fused @ lower)
         turn = np.linalg.solve(

@@ -1,15 +1,15 @@
 """Triangular maps against the printed program, and against another toolbox.
 
-The closed-form affine map against the printed program (12), component by component in cvxpy: once
-with each component's program compiled before, as the library keeps it, and once compiled in every
-call, as a newcomer writes it; misses where a ratio, against the compiled program, or an agreement
-is missed.
+The closed-form affine map against the printed program (12), component by component in
+cvxpy: once with each component's program compiled before, as the library keeps it, and
+once compiled in every call, as a newcomer writes it; misses where a ratio, against the
+compiled program, or an agreement is missed.
 
-Separable maps against the Triangular-Transport-Toolbox (github.com/MaxRamgraber): the update of a
-bent three-dimensional ensemble with one reading, full maps on both sides. The toolbox is one file,
-``transport_map.py``, and no package: the table, which names its commit, stays as it is where Python
-does not find it. Beside the times: the error of the posterior mean against importance sampling,
-over several seeds.
+Separable maps against the Triangular-Transport-Toolbox (github.com/MaxRamgraber): the
+update of a bent three-dimensional ensemble with one observation, full maps on both
+sides. The toolbox is one file, ``transport_map.py``, and no package: the table, which
+names its commit, stays as it is where Python does not find it. Beside the times: the
+error of the posterior mean against importance sampling, over several seeds.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """The EnKF's analysis against DAPPER's and against six lines of numpy, and whole cycles.
 
-The analyses are of a hundred members, with a full noise covariance and half of the components
-observed; DAPPER centres its draws besides. A cycle is one Runge-Kutta step, a reading of all
-components and the analysis, of Lorenz-63 and of Lorenz-96 with 40 components. Ours is `run`, which
-leaves a record, and `steps`, which keeps all states; DAPPER's is the loop of its `EnKF` without the
-statistics. Misses below the floors.
+The analyses have a hundred members, a full noise covariance and half of the components
+observed; DAPPER also centres its draws. A cycle is one Runge-Kutta step, an observation
+of all components and the analysis, of Lorenz-63 and of Lorenz-96 with 40 components.
+Ours is `run`, which leaves a record, and `steps`, which keeps all states; DAPPER's is
+the loop of its `EnKF` without the statistics. Misses below the floors.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def ring(x: np.ndarray, t: float) -> np.ndarray:
 def compare_calls(
     d: int, calls: dict[str, Any], rounds: int, each: int = 1
 ) -> Iterator[Row]:
-    """A row for each call that can be made, `each` of what is timed in a call."""
+    """Yield a row for each available call; `each` is the number of cycles in a call."""
     calls = {name: call for name, call in calls.items() if call is not None}
     times, ratios = compare_times(calls, rounds)
     for name in calls:

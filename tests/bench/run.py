@@ -1,4 +1,4 @@
-"""Every benchmark in turn; what missed its floors is told at the end, and ends with an error.
+"""Run every benchmark in turn; missed floors are listed at the end and give an error.
 
 python tests/bench/run.py [--force] [name …]
 """

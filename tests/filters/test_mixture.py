@@ -78,7 +78,7 @@ def test_a_reading_of_an_occulted_target_is_refused_and_a_missing_one_is_not() -
     angles = nothing.copy()
     angles[:2] = 0.1
     with pytest.raises(
-        FilterError, match="agent 0, t = .*: observed must be a target that"
+        FilterError, match="agent 0, t = .*: observed must be predicted by at least one"
     ):
         f.step(state, 0.0, [angles])
     assert np.array_equal(

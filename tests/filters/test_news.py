@@ -87,7 +87,7 @@ def test_what_all_receive_counts_twice_if_it_is_told() -> None:
     _, p = joint(2, readings, speed)
     start = network(2).start([PRIOR] * 2)
     once, twice = (
-        network(2, common=c).step(start, 1.0, [[np.nan, 0.4]] * 2) for c in ([1], [])
+        network(2, shared_components=c).step(start, 1.0, [[np.nan, 0.4]] * 2) for c in ([1], [])
     )
     assert np.allclose(once.mixtures[0].covs[0, :2, :2], p[:2, :2], atol=1e-10)
     assert once.ledger.scalars.sum() == 0

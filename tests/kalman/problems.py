@@ -1,4 +1,4 @@
-"""Problems that the tests of this folder share."""
+"""Linear models that the tests of this folder share."""
 
 from __future__ import annotations
 
@@ -16,17 +16,19 @@ M = 2
 def problem(
     rng: np.random.Generator, steps: int = STEPS, varying: bool = True
 ) -> dict[str, np.ndarray]:
-    """Matrices of a linear Gaussian model, another one in each step if `varying`."""
-    lead = (steps,) if varying else ()
+    """Matrices of a linear Gaussian model, different ones in each step if `varying`."""
+    leading = (steps,) if varying else ()
     return {
-        "F": rng.standard_normal((*lead, D, D)) / np.sqrt(D),
-        "H": rng.standard_normal((*lead, M, D)),
-        "Q": spd(rng, D, lead),
-        "R": spd(rng, M, lead),
+        # Scaled so that states neither grow nor vanish.
+        "F": rng.standard_normal((*leading, D, D)) / np.sqrt(D),
+        "H": rng.standard_normal((*leading, M, D)),
+        "Q": spd(rng, D, leading),
+        "R": spd(rng, M, leading),
     }
 
 
 def walk(d: int = 1) -> LinearModel:
+    """A random walk: x(t + dt) = x(t) + noise of covariance dt I."""
     return LinearModel.from_transition(
         d, lambda dt: np.eye(d), lambda t, dt: dt * np.eye(d)
     )

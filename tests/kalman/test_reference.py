@@ -1,4 +1,4 @@
-"""Filterpy's filters behind our shapes; ours, and one agent's Gaussian filter, against them."""
+"""Filters of filterpy with the library's interface, and the library's filters against them."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from distfilt.kalman import (
 from distfilt.models import Model
 from distfilt.sensors import (
     Sensor,
+    bearing,
     component,
     distance,
-    bearing,
     line_angle,
     range_bearing,
     stack,
@@ -44,12 +44,14 @@ def one_agent(
     times: Any,
     **options: Any,
 ) -> FilterResult:
-    """The Gaussian filter of one agent that holds all sensors."""
+    """Run the Gaussian filter of one agent that has all sensors."""
     y = np.asarray(y)
     f = GaussianFilter(model, [stack(sensors)], **options)
-    states = list(f.steps(f.start((mean, cov), runs=y.shape[1:-1]), times, [y]))
-    means = np.array([s.means[..., 0, :] for s in states])
-    covs = np.array([s.covariances[..., 0, :, :] for s in states])
+    # The runs are the axes between time and component; the agents' axis has length one.
+    start = f.start((mean, cov), runs=y.shape[1:-1])
+    states = list(f.steps(start, times, [y]))
+    means = np.array([state.means[..., 0, :] for state in states])
+    covs = np.array([state.covariances[..., 0, :, :] for state in states])
     return FilterResult(means, covs, np.zeros(means.shape[:-1]))
 
 
@@ -60,35 +62,37 @@ FILTERS = (filterpy_ekf, filterpy_ukf, extended, unscented)
 
 @pytest.mark.parametrize("varying", [False, True])
 @pytest.mark.parametrize("priors", [(), (6,)])
-@pytest.mark.parametrize("pattern", ["whole", "common", "own"])
-def test_equal_to_filterpy(
-    varying: bool, pattern: str, priors: tuple[int, ...]
+@pytest.mark.parametrize("missing", ["none", "common", "individual"])
+def test_the_kalman_filter_equals_filterpy_s(
+    varying: bool, missing: str, priors: tuple[int, ...]
 ) -> None:
-    """Runs with gaps and priors of their own; covariances are shared where they are the same."""
+    """With missing data and priors per run; equal covariances are shared between runs."""
     rng = np.random.default_rng(4)
-    p = problem(rng, steps=30, varying=varying)
+    model = problem(rng, steps=30, varying=varying)
     runs = 6
     mean = rng.standard_normal((*priors, D))
     cov = spd(rng, D, priors)
     y = rng.standard_normal((30, runs, M))
-    if pattern != "whole":
-        y = np.where(
-            rng.random((30, 1 if pattern == "common" else runs, M)) < 0.3, np.nan, y
-        )
-    ours = kalman_filter(mean, cov, y, **p)
-    theirs = filterpy_kf(mean, cov, y, **p)
-    full = np.broadcast_to(ours.covariances, theirs.covariances.shape)
-    np.testing.assert_allclose(ours.means, theirs.means, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(full, theirs.covariances, rtol=0, atol=1e-12)
+    if missing != "none":
+        # The same pattern for all runs, or one for each
+        patterns = 1 if missing == "common" else runs
+        y = np.where(rng.random((30, patterns, M)) < 0.3, np.nan, y)
+    result = kalman_filter(mean, cov, y, **model)
+    expected = filterpy_kf(mean, cov, y, **model)
+    covs = np.broadcast_to(result.covariances, expected.covariances.shape)
+    np.testing.assert_allclose(result.means, expected.means, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(covs, expected.covariances, rtol=0, atol=1e-12)
     np.testing.assert_allclose(
-        ours.log_likelihood, theirs.log_likelihood, rtol=0, atol=1e-11
+        result.log_likelihood, expected.log_likelihood, rtol=0, atol=1e-11
     )
-    shared = pattern in ("whole", "common") and not priors
-    assert ours.covariances.shape == (30, 1 if shared else runs, D, D)
-    assert (full == full.mT).all() and np.linalg.eigvalsh(full).min() > 0
+    # One covariance for all runs, if prior and pattern are common
+    is_shared = missing != "individual" and not priors
+    assert result.covariances.shape == (30, 1 if is_shared else runs, D, D)
+    assert (covs == covs.mT).all()
+    assert np.linalg.eigvalsh(covs).min() > 0
 
 
-BENT = (
+NONLINEAR = (
     (
         [0.0, 0.0, 1.0, 0.0, 0.2],
         turning(sigma=0.1, turn_sigma=0.05),
@@ -106,39 +110,41 @@ BENT = (
 )
 
 
-@pytest.mark.parametrize(("start", "model", "sensors"), BENT, ids=["turn", "many"])
+@pytest.mark.parametrize(("start", "model", "sensors"), NONLINEAR, ids=["turn", "many"])
 @pytest.mark.parametrize(
-    ("ours", "theirs"), [(extended, filterpy_ekf), (unscented, filterpy_ukf)]
+    ("filter_", "reference"), [(extended, filterpy_ekf), (unscented, filterpy_ukf)]
 )
-def test_nonlinear_filters_agree_with_filterpy(
-    ours: Callable[..., Any],
-    theirs: Callable[..., Any],
+def test_nonlinear_filters_equal_filterpy_s(
+    filter_: Callable[..., Any],
+    reference: Callable[..., Any],
     start: Any,
     model: Model,
     sensors: Any,
 ) -> None:
-    """Runs with gaps of their own, angles that wrap, irregular times."""
+    """With missing data per run, angles that wrap, irregular times."""
     rng = np.random.default_rng(19)
     d = len(start)
     times = np.array([0.1, 0.3, 0.4, 0.8])
     truth = start + 0.1 * rng.standard_normal((3, d))
-    path = np.stack([model.step(truth, 0.0, t) for t in times])
-    y = stack(sensors).observe(path, rng=rng)
+    states = np.stack([model.step(truth, 0.0, t) for t in times])
+    y = stack(sensors).observe(states, rng=rng)
+    # A whole observation of run 0, and single components of the others
     y[1, 0] = np.nan
     y[2, 1, 0] = np.nan
     y[3, 2, 1] = np.nan
     cov = 0.01 * spd(rng, d)
-    both = ours, theirs
-    run, other = (
-        f(start, cov, y, model=model, sensors=sensors, times=times) for f in both
+    options = {"model": model, "sensors": sensors, "times": times}
+    run = filter_(start, cov, y, **options)
+    expected = reference(start, cov, y, **options)
+    np.testing.assert_allclose(run.means, expected.means, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        run.covariances, expected.covariances, rtol=0, atol=1e-12
     )
-    np.testing.assert_allclose(run.means, other.means, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(run.covariances, other.covariances, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("filter_", FILTERS)
 def test_an_angle_may_wrap(filter_: Callable[..., Any]) -> None:
-    """Bearings on either side of the cut: turned by half a turn, nothing but the signs changes."""
+    """Bearings on either side of ±π: rotated by half a turn, only the signs change."""
     options = {
         "model": walk(2),
         "sensors": [bearing([0, 1], std=0.01)],
@@ -147,52 +153,66 @@ def test_an_angle_may_wrap(filter_: Callable[..., Any]) -> None:
     mean = np.array([-1.0, 0.02])
     cov = 0.01 * FULL / 4
     run = filter_(mean, cov, [[-np.pi + 0.02]], **options)
+    # The analysis crosses the negative axis.
     assert run.means[0, 1] < -0.01
-    other = filter_(-mean, cov, [[0.02]], **options)
-    np.testing.assert_allclose(run.means, -other.means, atol=1e-12)
-    np.testing.assert_allclose(run.covariances, other.covariances, atol=1e-12)
-    turned = filter_(mean, cov, [[np.pi + 0.02]], **options)
-    np.testing.assert_allclose(turned.means, run.means, atol=1e-12)
+    opposite = filter_(-mean, cov, [[0.02]], **options)
+    np.testing.assert_allclose(run.means, -opposite.means, atol=1e-12)
+    np.testing.assert_allclose(run.covariances, opposite.covariances, atol=1e-12)
+    # A full turn more is the same observation.
+    wrapped = filter_(mean, cov, [[np.pi + 0.02]], **options)
+    np.testing.assert_allclose(wrapped.means, run.means, atol=1e-12)
 
 
 def test_what_the_sensor_cannot_see_is_missing() -> None:
-    """A mean at the sensor's place has no angle; its distance is used all the same."""
+    """A mean at the sensor's position has no bearing; the distance is used nevertheless."""
     options = {
         "model": walk(2),
         "times": [1e-9],
         "sensors": [range_bearing([0, 1], std=[0.3, 0.1])],
     }
-    here, blind = (
-        extended([0.0, 0.0], FULL, [[0.5, z]], **options) for z in (0.1, np.nan)
-    )
-    np.testing.assert_allclose(here.means, blind.means, atol=1e-14)
-    np.testing.assert_allclose(here.covariances, blind.covariances, atol=1e-14)
+    # With a bearing that cannot be compared, and without any
+    run = extended([0.0, 0.0], FULL, [[0.5, 0.1]], **options)
+    expected = extended([0.0, 0.0], FULL, [[0.5, np.nan]], **options)
+    np.testing.assert_allclose(run.means, expected.means, atol=1e-14)
+    np.testing.assert_allclose(run.covariances, expected.covariances, atol=1e-14)
 
 
 @pytest.mark.parametrize("filter_", [extended, filterpy_ekf])
 def test_extended_steps_are_the_linearised_formulas(
     filter_: Callable[..., Any],
 ) -> None:
-    def flow(x: np.ndarray, t: float, dt: float) -> np.ndarray:
-        return np.stack([np.sin(x[..., 0]) + t, x[..., 0] * x[..., 1] * dt], axis=-1)
+    """Two forecasts with derivatives by hand, and one analysis."""
 
-    model = Model(2, flow, lambda t, dt: (1 + t) * dt * FULL)
-    sensor = Sensor(2, lambda x: np.stack([x[..., 0] ** 2, x.sum(-1)], -1), FULL)
-    options = {"model": model, "sensors": [sensor], "times": [2.0, 2.5]}
-    x = np.array([0.3, -0.7])
+    def transition(x: np.ndarray, t: float, dt: float) -> np.ndarray:
+        first = np.sin(x[..., 0]) + t
+        second = x[..., 0] * x[..., 1] * dt
+        return np.stack([first, second], axis=-1)
+
+    def observe(x: np.ndarray) -> np.ndarray:
+        return np.stack([x[..., 0] ** 2, x.sum(axis=-1)], axis=-1)
+
+    options = {
+        "model": Model(2, transition, lambda t, dt: (1 + t) * dt * FULL),
+        "sensors": [Sensor(2, observe, FULL)],
+        "times": [2.0, 2.5],
+    }
+    start = np.array([0.3, -0.7])
+    x = start
     p = FULL
     for t, dt in ((0.0, 2.0), (2.0, 0.5)):
-        slope = np.array([[np.cos(x[0]), 0.0], [x[1] * dt, x[0] * dt]])
-        x = flow(x, t, dt)
-        p = slope @ p @ slope.T + (1 + t) * dt * FULL
-    gone = [np.nan, np.nan]
-    ahead = filter_([0.3, -0.7], FULL, [gone, gone], **options)
-    np.testing.assert_allclose(ahead.means[1], x)
-    np.testing.assert_allclose(ahead.covariances[1], p, atol=1e-8)
-    run = filter_([0.3, -0.7], FULL, [gone, [1.0, -1.0]], **options)
-    gap = [1.0 - x[0] ** 2, -1.0 - x.sum()]
+        # P ← J P Jᵀ + Q(t, dt), with the Jacobian at the last mean
+        jacobian = np.array([[np.cos(x[0]), 0.0], [x[1] * dt, x[0] * dt]])
+        p = jacobian @ p @ jacobian.T + (1 + t) * dt * FULL
+        x = transition(x, t, dt)
+    missing = [np.nan, np.nan]
+    forecast = filter_(start, FULL, [missing, missing], **options)
+    np.testing.assert_allclose(forecast.means[1], x)
+    np.testing.assert_allclose(forecast.covariances[1], p, atol=1e-8)
+    # The analysis is that of the linearised sensor.
+    observed = np.array([1.0, -1.0])
+    run = filter_(start, FULL, [missing, observed], **options)
+    innovation = observed - observe(x)
     h = np.array([[2 * x[0], 0.0], [1.0, 1.0]])
-    for ours, exact in zip(
-        (run.means, run.covariances), condition(x, p, gap, h, FULL), strict=True
-    ):
-        np.testing.assert_allclose(ours[1], exact, atol=1e-7)
+    mean, cov = condition(x, p, innovation, h, FULL)
+    np.testing.assert_allclose(run.means[1], mean, atol=1e-7)
+    np.testing.assert_allclose(run.covariances[1], cov, atol=1e-7)

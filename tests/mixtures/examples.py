@@ -1,4 +1,4 @@
-"""Mixtures that the tests of this folder share; none is diagonal or centred."""
+"""Mixtures that several tests use; none is diagonal or centred."""
 
 from __future__ import annotations
 
@@ -14,50 +14,55 @@ def random_mixture(
 ) -> GaussianMixture:
     """Full covariances of differing shape, uneven weights."""
     rng = np.random.default_rng(seed)
+    # Covariances R Rᵀ + 0.2 I are positive definite.
     roots = rng.standard_normal((size, dim, dim)) + 0.5 * np.eye(dim)
     covs = roots @ roots.mT + 0.2 * np.eye(dim)
-    w = rng.dirichlet(np.full(size, 2.0))
-    return GaussianMixture(w, spread * rng.standard_normal((size, dim)) + 1.0, covs)
+    weights = rng.dirichlet(np.full(size, 2.0))
+    means = spread * rng.standard_normal((size, dim)) + 1.0
+    return GaussianMixture(weights, means, covs)
 
 
-def affine(
+def transform(
     p: GaussianMixture, matrix: np.ndarray, shift: np.ndarray
 ) -> GaussianMixture:
-    """The same density in other coordinates."""
-    return GaussianMixture.construct(
-        p.weights.copy(), p.means @ matrix.T + shift, matrix @ p.covs @ matrix.T
-    )
+    """The density of A x + b: means A m + b, covariances A P Aᵀ."""
+    means = p.means @ matrix.T + shift
+    covs = matrix @ p.covs @ matrix.T
+    return GaussianMixture.construct(p.weights.copy(), means, covs)
 
 
-def shuffled(p: GaussianMixture, seed: int = 0) -> GaussianMixture:
-    """The same density with its mixands in another order."""
+def shuffle(p: GaussianMixture, seed: int = 0) -> GaussianMixture:
+    """The same density with its components in another order."""
     order = np.random.default_rng(seed).permutation(p.n_components)
     return GaussianMixture(p.weights[order], p.means[order], p.covs[order])
 
 
-def same(a: GaussianMixture, b: GaussianMixture, tolerance: float = 1e-9) -> None:
-    """Both have the same mixands, in whatever order."""
+def assert_same(
+    a: GaussianMixture, b: GaussianMixture, tolerance: float = 1e-9
+) -> None:
+    """Both have the same components, in any order."""
     assert a.n_components == b.n_components
-    first, second = (
-        np.array(
-            sorted(
-                np.c_[p.means, p.weights, p.covs.reshape(p.n_components, -1)]
-                .round(12)
-                .tolist()
-            )
-        )
-        for p in (a, b)
-    )
-    np.testing.assert_allclose(
-        first, second, rtol=tolerance, atol=tolerance * np.abs(second).max()
-    )
+    first = sort_components(a)
+    second = sort_components(b)
+    absolute = tolerance * np.abs(second).max()
+    np.testing.assert_allclose(first, second, rtol=tolerance, atol=absolute)
 
 
-def scales(dim: int, target_dim: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Another frame, in units of 1e-3 to 1e5 and far away; the target apart from the rest."""
+def sort_components(p: GaussianMixture) -> np.ndarray:
+    """Rows of means, weights and covariances, sorted by the rounded mean."""
+    rows = np.c_[p.means, p.weights, p.covs.reshape(p.n_components, -1)]
+    return np.array(sorted(rows.round(12).tolist()))
+
+
+def random_frame(dim: int, target_dim: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix and shift of other coordinates, in units of 1e-3 to 1e5 and far from the origin.
+
+    Target and ego components are not mixed.
+    """
     rng = np.random.default_rng(dim)
     matrix = rng.standard_normal((dim, dim)) + 2 * np.eye(dim)
-    matrix[:target_dim, target_dim:] = matrix[target_dim:, :target_dim] = 0.0
-    return np.geomspace(1e-3, 1e5, dim)[:, None] * matrix, 100 * rng.standard_normal(
-        dim
-    )
+    matrix[:target_dim, target_dim:] = 0.0
+    matrix[target_dim:, :target_dim] = 0.0
+    units = np.geomspace(1e-3, 1e5, dim)
+    shift = 100 * rng.standard_normal(dim)
+    return units[:, None] * matrix, shift

@@ -7,97 +7,96 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from distfilt.mixtures import GaussianMixture, jeffreys_by_sampling, jeffreys_of_many
-from distfilt.mixtures.reduction import gaussian_divergences as between
+from distfilt.mixtures.reduction import gaussian_divergences
 
-from .examples import affine, random_mixture, scales, shuffled
+from .examples import random_frame, random_mixture, shuffle, transform
 
 UNIT = [[[1.0]], [[1.0]]]
 P = random_mixture(1, 2, 1, 1.0)
 Q = random_mixture(1, 2, 2, 1.0)
-F = P.log_density
-NEAR = GaussianMixture([1.0], P.means + 0.3, P.covs)
+SHIFTED = GaussianMixture([1.0], P.means + 0.3, P.covs)
 
 
 @pytest.mark.parametrize(("size", "dim"), [(1, 1), (3, 3), (5, 2), (2, 6)])
 def test_log_density_is_scipys(size: int, dim: int) -> None:
     p = random_mixture(size, dim, 10 * size + dim)
     x = np.random.default_rng(0).standard_normal((4, 7, dim)) * 3
-    each = zip(p.weights, p.means, p.covs, strict=True)
-    wanted = sum(w * multivariate_normal(m, c).pdf(x) for w, m, c in each)
+    density = 0
+    for w, m, c in zip(p.weights, p.means, p.covs, strict=True):
+        density = density + w * multivariate_normal(m, c).pdf(x)
     assert p.log_density(x).shape == (4, 7)
-    assert np.allclose(p.log_density(x), np.log(wanted), rtol=1e-11)
+    assert np.allclose(p.log_density(x), np.log(density), rtol=1e-11)
     parts = p.component_log_densities(x)
     assert parts.shape == (4, 7, size)
     for k in range(size):
-        assert np.allclose(
-            parts[..., k], multivariate_normal(p.means[k], p.covs[k]).logpdf(x)
-        )
+        logs = multivariate_normal(p.means[k], p.covs[k]).logpdf(x)
+        assert np.allclose(parts[..., k], logs)
 
 
 def test_many_points_are_evaluated_in_blocks() -> None:
     p = random_mixture(40, 3, 1)
     x = np.random.default_rng(0).standard_normal((40_000, 3))
-    few = np.arange(0, 40_000, 1777)
-    assert np.allclose(p.log_density(x)[few], p.log_density(x[few]), rtol=1e-13)
-    assert np.allclose(
-        p.component_log_densities(x)[few], p.component_log_densities(x[few])
-    )
+    # Single points of a large call have the values of a small one.
+    index = np.arange(0, 40_000, 1777)
+    few = x[index]
+    assert np.allclose(p.log_density(x)[index], p.log_density(few), rtol=1e-13)
+    logs = p.component_log_densities(x)[index]
+    assert np.allclose(logs, p.component_log_densities(few))
 
 
 def test_tails_do_not_underflow() -> None:
     p = GaussianMixture([0.5, 0.5], [[0.0], [1e4]], [[[1.0]], [[4.0]]])
-    assert np.isclose(
-        p.log_density([5e3]), np.log(0.5) - 0.5 * np.log(8 * np.pi) - 0.125 * 25e6
-    )
+    # The wider component alone: log(w) - ½ log(2 π 4) - ½ x² / 4.
+    expected = np.log(0.5) - 0.5 * np.log(8 * np.pi) - 0.125 * 25e6
+    assert np.isclose(p.log_density([5e3]), expected)
     assert np.isfinite(p.log_density([-1e8]))
     zero = GaussianMixture([1.0, 0.0], [[0.0], [1.0]], UNIT)
     assert np.isclose(zero.log_density([0.0]), -0.5 * np.log(2 * np.pi))
 
 
 def test_density_in_other_coordinates_and_in_another_order() -> None:
+    """A change of coordinates divides the density by |det A|."""
     p = random_mixture(4, 3, 2)
-    (matrix, shift) = scales(3)
+    matrix, shift = random_frame(3)
     x = np.random.default_rng(0).standard_normal((20, 3)) * 3
-    there = affine(p, matrix, shift).log_density(x @ matrix.T + shift)
-    assert np.allclose(
-        there, p.log_density(x) - np.linalg.slogdet(matrix)[1], atol=1e-6
-    )
-    far = affine(p, np.eye(3), np.full(3, 4.2e7))
+    logs = transform(p, matrix, shift).log_density(x @ matrix.T + shift)
+    expected = p.log_density(x) - np.linalg.slogdet(matrix)[1]
+    assert np.allclose(logs, expected, atol=1e-6)
+    far = transform(p, np.eye(3), np.full(3, 4.2e7))
     assert np.allclose(far.log_density(x + 4.2e7), p.log_density(x), atol=1e-6)
-    assert np.allclose(shuffled(p).log_density(x), p.log_density(x), rtol=1e-13)
+    assert np.allclose(shuffle(p).log_density(x), p.log_density(x), rtol=1e-13)
 
 
 def test_a_marginal_is_the_integral() -> None:
     p = random_mixture(3, 2, 3)
     x = np.linspace(-60, 60, 20_001)
-    for at in (-1.0, 2.5):
-        whole = np.exp(p.log_density(np.column_stack([x, np.full_like(x, at)])))
-        part = p.marginal([1]).log_density([at])
-        assert np.isclose(np.trapezoid(whole, x), np.exp(part), rtol=1e-9)
-    back = p.marginal([1, 0])
-    assert np.array_equal(back.means, p.means[:, ::-1])
-    assert np.array_equal(back.covs, p.covs[:, ::-1, ::-1])
+    for y in (-1.0, 2.5):
+        points = np.column_stack([x, np.full_like(x, y)])
+        integral = np.trapezoid(np.exp(p.log_density(points)), x)
+        marginal = p.marginal([1]).log_density([y])
+        assert np.isclose(integral, np.exp(marginal), rtol=1e-9)
+    # Of all components in reverse order.
+    reverse = p.marginal([1, 0])
+    assert np.array_equal(reverse.means, p.means[:, ::-1])
+    assert np.array_equal(reverse.covs, p.covs[:, ::-1, ::-1])
 
 
 def test_moments_are_the_draws() -> None:
     p = random_mixture(3, 3, 4)
     x = p.rvs(200_000, rng=np.random.default_rng(2))
     # Five standard errors.
-    assert np.abs(x.mean(axis=0) - p.mean).max() < 5 * np.sqrt(
-        np.diag(p.cov).max() / 200_000
-    )
+    error = np.sqrt(np.diag(p.cov).max() / 200_000)
+    assert np.abs(x.mean(axis=0) - p.mean).max() < 5 * error
     assert np.abs(np.cov(x, rowvar=False) - p.cov).max() < 0.02 * np.abs(p.cov).max()
-    gap = p.means - p.weights @ p.means
-    by_hand = sum(
-        w * (c + np.outer(g, g)) for w, c, g in zip(p.weights, p.covs, gap, strict=True)
-    )
-    assert np.allclose(p.cov, by_hand, rtol=1e-13)
+    # P = Σ w (P_l + (m_l - m)(m_l - m)ᵀ)
+    differences = p.means - p.weights @ p.means
+    cov = np.zeros((3, 3))
+    for w, c, d in zip(p.weights, p.covs, differences, strict=True):
+        cov += w * (c + np.outer(d, d))
+    assert np.allclose(p.cov, cov, rtol=1e-13)
     one = p.moment_match()
-    assert (
-        one.n_components == 1
-        and np.allclose(one.mean, p.mean)
-        and np.allclose(one.cov, p.cov)
-    )
+    assert one.n_components == 1
+    assert np.allclose(one.mean, p.mean) and np.allclose(one.cov, p.cov)
 
 
 def test_a_mixture_owns_its_arrays() -> None:
@@ -119,8 +118,10 @@ def test_a_mixture_owns_its_arrays() -> None:
 # ----------------------------------------------------------------------------- divergences
 
 
-def closed(p: GaussianMixture, q: GaussianMixture) -> float:
-    return 0.5 * float(between(p, q)[0, 0] + between(q, p)[0, 0])
+def closed_form(p: GaussianMixture, q: GaussianMixture) -> float:
+    return 0.5 * float(
+        gaussian_divergences(p, q)[0, 0] + gaussian_divergences(q, p)[0, 0]
+    )
 
 
 def test_gaussian_divergences_are_the_integral() -> None:
@@ -131,51 +132,59 @@ def test_gaussian_divergences_are_the_integral() -> None:
     lq = q.component_log_densities(x)
     for i, j in np.ndindex(3, 2):
         value = np.trapezoid(np.exp(lp[:, i]) * (lp[:, i] - lq[:, j]), x[:, 0])
-        assert np.isclose(between(p, q)[i, j], value, rtol=1e-9)
+        assert np.isclose(gaussian_divergences(p, q)[i, j], value, rtol=1e-9)
 
 
-def test_gaussian_divergences_are_no_matter_of_coordinates_and_never_negative() -> None:
+def test_gaussian_divergences_are_invariant_and_never_negative() -> None:
     p = random_mixture(4, 4, 1)
     q = random_mixture(3, 4, 2)
-    assert np.allclose(
-        between(affine(p, *scales(4)), affine(q, *scales(4))), between(p, q)
+    matrix, shift = random_frame(4)
+    transformed = gaussian_divergences(
+        transform(p, matrix, shift), transform(q, matrix, shift)
     )
+    assert np.allclose(transformed, gaussian_divergences(p, q))
     for seed in range(30):
         p = random_mixture(4, 4, seed)
-        assert between(p, p).min() >= 0 and np.diag(between(p, p)).max() < 1e-12
+        divergences = gaussian_divergences(p, p)
+        assert divergences.min() >= 0 and np.diag(divergences).max() < 1e-12
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3])
-def test_quadrature_meets_the_closed_form(dim: int) -> None:
+def test_quadrature_equals_the_closed_form(dim: int) -> None:
     p = random_mixture(1, dim, 1, 1.0)
     q = random_mixture(1, dim, 3, 1.0)
-    far = 9 * np.sqrt(p.cov.diagonal() + q.cov.diagonal()) + abs(p.mean) + abs(q.mean)
+    std = np.sqrt(p.cov.diagonal() + q.cov.diagonal())
+    edge = 9 * std + abs(p.mean) + abs(q.mean)
     # Constants in the logarithms do not matter.
-    found = jeffreys_of_many(
+    divergences = jeffreys_of_many(
         lambda x: p.log_density(x) + 900,
         [lambda x: q.log_density(x) - 50, p.log_density],
-        -far,
-        far,
+        -edge,
+        edge,
         nodes=130,
     )
-    assert np.isclose(found[0].value, closed(p, q), rtol=1e-6) and found[0].error == 0
-    assert abs(found[1].value) < 1e-12
+    assert (
+        np.isclose(divergences[0].value, closed_form(p, q), rtol=1e-6)
+        and divergences[0].error == 0
+    )
+    assert abs(divergences[1].value) < 1e-12
 
 
-def test_sampling_meets_the_closed_form_within_its_standard_error() -> None:
-    found = [
-        jeffreys_by_sampling(
-            lambda x: F(x) - 3,
-            NEAR.log_density,
+def test_sampling_equals_the_closed_form_within_its_standard_error() -> None:
+    values = []
+    errors = []
+    for seed in range(200):
+        divergence = jeffreys_by_sampling(
+            lambda x: P.log_density(x) - 3,
+            SHIFTED.log_density,
             Q,
             members=800,
             rng=np.random.default_rng(seed),
         )
-        for seed in range(200)
-    ]
-    spread = np.std([d.value for d in found], ddof=1)
-    assert (
-        abs(np.mean([d.value for d in found]) - closed(P, NEAR)) < 4 * spread / 200**0.5
-    )
+        values.append(divergence.value)
+        errors.append(divergence.error)
+    std = np.std(values, ddof=1)
+    # Four standard errors of the mean.
+    assert abs(np.mean(values) - closed_form(P, SHIFTED)) < 4 * std / 200**0.5
     # A standard deviation from 200 draws is known to 5%; 20% is four of its standard errors.
-    assert np.isclose(np.mean([d.error for d in found]), spread, rtol=0.2)
+    assert np.isclose(np.mean(errors), std, rtol=0.2)

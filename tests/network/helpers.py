@@ -57,7 +57,7 @@ def arrivals(
 ) -> np.ndarray:
     """Return whether agent i receives the message of agent j, (runs, A, A)."""
     arrived = np.zeros((runs, graph.n_agents, graph.n_agents), dtype=bool)
-    lost = faults.lost_messages(graph, round_, runs)
+    lost = faults.draw_losses(graph, round_, runs)
     arrived[:, graph.receivers, graph.senders] = ~lost
     return arrived
 

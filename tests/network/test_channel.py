@@ -1,4 +1,4 @@
-"""The channel: what it delivers, what that costs, who can change it, and how it fails."""
+"""The channel: delivery, cost, protection of payloads, losses and delays."""
 
 from __future__ import annotations
 
@@ -86,7 +86,8 @@ def _full(*shape: int) -> np.ndarray:
     return np.full(shape, NAN)
 
 
-# Runs, payloads, and the messages, scalars and bytes of each agent; agent 0 has two receivers.
+# Runs, payloads, and the messages, scalars and bytes of each agent; agent 0 has two
+# receivers.
 COSTS = {
     "a mixture as a flat tuple": (
         (),

@@ -1,4 +1,4 @@
-"""Averages, the maximum, and the minimiser of a sum: what they keep, how fast, and at what cost."""
+"""Averages, the maximum, and the minimiser of a sum: properties, speed and cost."""
 
 from __future__ import annotations
 
@@ -214,8 +214,8 @@ def _residuals(rho: float, iterations: int) -> list[tuple[float, float]]:
 def test_admm_stops_once_both_residuals_are_below_the_tolerance(rho: float) -> None:
     """Both residuals, the dual one with its ρ: each is the last to fall for some ρ.
 
-    The decision is paid for: rounds of averaging, and of the maximum of two numbers, which take
-    the diameter each.
+    The decision is paid for: rounds of averaging, and of the maximum of two numbers,
+    which take the diameter each.
     """
     series = _residuals(rho, 600)
     tolerance = 1e-4
@@ -227,7 +227,8 @@ def test_admm_stops_once_both_residuals_are_below_the_tolerance(rho: float) -> N
     residuals = (result.primal, result.dual)
     assert np.allclose(residuals, series[first - 1], rtol=1e-6, atol=1e-12)
     assert np.abs(result.common - _CENTRES.mean(axis=0)).max() < 1e-3
-    # Two rounds for the average of 2 numbers and two for the maximum of 2, in each iteration.
+    # Two rounds for the average of 2 numbers and two for the maximum of 2, in each
+    # iteration.
     assert channel.ledger.rounds == 2 * first + 2 * first
     scalars = 2 * 2 * first + 2 * 2 * first
     assert (channel.ledger.scalars == scalars * STAR.out_degree).all()

@@ -14,7 +14,7 @@ from tests.network.helpers import DISK, STAR
 
 def _series(faults: Faults, graph: Graph, rounds: int, runs: int) -> np.ndarray:
     """Return the losses of many rounds, (rounds, runs, E)."""
-    return np.stack([faults.lost_messages(graph, k, runs) for k in range(rounds)])
+    return np.stack([faults.draw_losses(graph, k, runs) for k in range(rounds)])
 
 
 def _is_plausible(events: np.ndarray, cases: np.ndarray, probability: float) -> bool:
@@ -28,15 +28,15 @@ def test_losses_depend_on_seed_run_round_and_link_alone(
     burst_length: float | None,
 ) -> None:
     faults = Faults(loss=0.5, seed=11, burst_length=burst_length)
-    lost = faults.lost_messages(DISK, 20, 10)
+    lost = faults.draw_losses(DISK, 20, 10)
     # Neither on the rounds that were asked for before nor on the number of runs.
     assert (_series(faults, DISK, 21, 10)[-1] == lost).all()
-    assert (faults.lost_messages(DISK, 20, 4) == lost[:4]).all()
+    assert (faults.draw_losses(DISK, 20, 4) == lost[:4]).all()
     # On round, run and seed.
-    assert (faults.lost_messages(DISK, 21, 10) != lost).any()
+    assert (faults.draw_losses(DISK, 21, 10) != lost).any()
     assert (lost[0] != lost[1]).any()
     other = Faults(loss=0.5, seed=12, burst_length=burst_length)
-    assert (other.lost_messages(DISK, 20, 10) != lost).any()
+    assert (other.draw_losses(DISK, 20, 10) != lost).any()
 
 
 def test_stored_losses_stay() -> None:
@@ -51,7 +51,7 @@ def test_stored_losses_stay() -> None:
 
     seed = 5
     round_ = 2
-    lost = Faults(loss=0.4, seed=seed).lost_messages(STAR, round_, 3)
+    lost = Faults(loss=0.4, seed=seed).draw_losses(STAR, round_, 3)
     for run in range(3):
         key = mix((seed + golden * (round_ + 1)) & mask)
         run_bits = mix(key ^ (run * golden & mask))
@@ -84,7 +84,8 @@ def test_bursts_have_their_rate_and_their_length(
 def test_each_round_of_a_burst_follows_from_the_one_before() -> None:
     """The numbers drawn are those of independent losses.
 
-    A link fails if its number is below p, and as in the round before if it is below p + q.
+    A link fails if its number is below p, and as in the round before if it is below p +
+    q.
     """
     loss = 0.2
     burst_length = 8.0
@@ -111,7 +112,7 @@ def test_bursts_of_any_rate_end(seed: int, loss: float, burst_length: float) -> 
             Faults(loss=loss, burst_length=burst_length)
         return
     faults = Faults(loss=loss, burst_length=max(burst_length, shortest), seed=seed)
-    lost = faults.lost_messages(STAR, 0, 5)
+    lost = faults.draw_losses(STAR, 0, 5)
     assert lost.shape == (5, 4)
     if loss in (0.0, 1.0):
         assert (lost == bool(loss)).all()
@@ -133,14 +134,14 @@ def test_loss_by_receiver_and_by_link() -> None:
 def test_windows_hold_losses_and_silence() -> None:
     faults = Faults(loss=1.0, silent=[1], during=[(2, 4), (6, np.inf)])
     active = [False, False, True, True, False, False, True, True]
-    lost = [bool(faults.lost_messages(STAR, k, 1).all()) for k in range(8)]
+    lost = [bool(faults.draw_losses(STAR, k, 1).all()) for k in range(8)]
     assert lost == active
     # The silent agent has two links, there and back.
     off = [int((~faults.active_links(STAR, k)).sum()) for k in range(8)]
     assert off == [2 * flag for flag in active]
     # With a time the windows are in seconds: closed on the left, open on the right.
     timed = Faults(loss=1.0, during=[(0.5, 1.0)])
-    lost = [bool(timed.lost_messages(STAR, 9, 1, t).all()) for t in (0.4, 0.5, 1.0)]
+    lost = [bool(timed.draw_losses(STAR, 9, 1, t).all()) for t in (0.4, 0.5, 1.0)]
     assert lost == [False, True, False]
 
 
@@ -148,12 +149,12 @@ def test_faults_together_fail_in_every_way() -> None:
     a = Faults(loss=0.3, seed=1)
     b = Faults(loss=0.4, seed=2, during=[(0, 5)], delay=1)
     c = Faults(silent=[2], delay=2)
-    by_a, by_b = (x.lost_messages(STAR, 3, 9) for x in (a, b))
+    by_a, by_b = (x.draw_losses(STAR, 3, 9) for x in (a, b))
     # In any grouping.
     for faults in (a | b | c, a | (b | c)):
-        assert (faults.lost_messages(STAR, 3, 9) == (by_a | by_b)).all()
-        later = a.lost_messages(STAR, 6, 9)
-        assert (faults.lost_messages(STAR, 6, 9) == later).all()
+        assert (faults.draw_losses(STAR, 3, 9) == (by_a | by_b)).all()
+        later = a.draw_losses(STAR, 6, 9)
+        assert (faults.draw_losses(STAR, 6, 9) == later).all()
         assert (faults.active_links(STAR) == c.active_links(STAR)).all()
         assert faults.total_delay == 3
         assert not faults.is_perfect

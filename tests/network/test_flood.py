@@ -1,4 +1,4 @@
-"""Flooding: who knows which values after how many rounds, and at what cost."""
+"""Flooding: which values agents know after how many rounds, and the cost."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ def test_all_agents_know_all_values_in_the_end(graph: Graph) -> None:
     average, known = network.flooding(values, channel)
     assert known.all()
     assert np.abs(average - values.mean(axis=0)).max() < 1e-14
-    # Each agent sends each value once on each of its links, with the number of its agent.
+    # Each agent sends each value once on each of its links, with the number of its
+    # agent.
     sent = 3 * graph.n_agents * graph.out_degree
     assert (channel.ledger.scalars == sent).all()
     # The values that arrive last are still forwarded, in one round more.

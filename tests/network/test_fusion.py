@@ -52,14 +52,15 @@ def _fuse_one(name: str, m: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.n
     """Return the fusion of an agent's Gaussian, the first, with the received ones."""
     count = len(m)
     if name == "naive":
-        # The product of all: P⁻¹ = Σ P_j⁻¹, an intersection of P_j / n with weights 1 / n.
+        # The product of all: P⁻¹ = Σ P_j⁻¹, an intersection of P_j / n with weights 1 /
+        # n.
         return pure.intersect_gaussians(m, p / count, np.full(count, 1 / count))
     if name == "arithmetic":
         # Mean and covariance of the mixture with equal weights.
         mixture_mean = m.mean(axis=0)
         deviation = m - mixture_mean
-        outer = deviation[..., :, None] * deviation[..., None, :]
-        return mixture_mean, (p + outer).mean(axis=0)
+        spread = deviation[..., :, None] * deviation[..., None, :]
+        return mixture_mean, (p + spread).mean(axis=0)
     if name == "pull":
         return m[0] + GAIN * (m - m[0]).sum(axis=0), p[0]
     omega = pure.intersection_weights(p, rule=name)

@@ -67,7 +67,7 @@ def test_links_and_laplacian_by_their_definition(
     assert (graph.incidence @ np.ones(graph.senders.size) == degrees).all()
     for agent in range(agents):
         assert graph.neighbours(agent) == tuple(np.flatnonzero(dense[agent]))
-    if not graph.directed:
+    if not graph.is_directed:
         # The opposite link has receiver and sender exchanged.
         assert (graph.receivers[graph.reverse] == graph.senders).all()
         assert (graph.senders[graph.reverse] == graph.receivers).all()
@@ -84,8 +84,8 @@ def test_hops_are_scipy_s_shortest_paths(
     expected = np.where(reachable, distances, -1)
     for agent in range(agents):
         assert (graph.hops(agent) == expected[agent]).all()
-    assert graph.connected == reachable.all()
-    if graph.connected:
+    assert graph.is_connected == reachable.all()
+    if graph.is_connected:
         assert graph.diameter == distances.max()
 
 
@@ -125,7 +125,7 @@ def test_edges_count_once_and_run_from_sender_to_receiver() -> None:
         assert (Graph.from_edges(3, edges).links != graphs.path(3).links).nnz == 0
     # Agent 2 receives from nobody.
     one_way = Graph.from_edges(3, [(0, 1), (1, 2)], directed=True)
-    assert one_way.directed
+    assert one_way.is_directed
     assert one_way.neighbours(2) == ()
 
 
@@ -133,7 +133,7 @@ def test_graphs_of_networkx_keep_their_labels_or_their_order() -> None:
     # In the order of the nodes: camera 0, screen 1, log 2; from sender to receiver.
     digraph = nx.DiGraph([("camera", "screen"), ("screen", "log")])
     graph = Graph.from_networkx(digraph)
-    assert graph.directed
+    assert graph.is_directed
     assert graph.neighbours(0) == ()
     assert graph.neighbours(1) == (0,)
     # Parallel edges count once.

@@ -58,7 +58,7 @@ def test_column_stochastic_weights_of_a_digraph(seed: int, agents: int) -> None:
 @given(st.integers(0, 1000), st.integers(2, 8))
 def test_doubly_stochastic_weights_of_a_digraph(seed: int, agents: int) -> None:
     graph = random_graph(seed, agents, directed=True)
-    if not graph.connected:
+    if not graph.is_connected:
         with pytest.raises(ValueError, match="strongly"):
             weights.doubly_stochastic(graph)
         return
@@ -118,7 +118,8 @@ def test_the_fastest_weights_reach_the_convex_optimum(graph: Graph) -> None:
     dense = w.matrix.toarray()
     assert (dense == dense.T).all()
     assert np.abs(dense.sum(axis=0) - 1).max() < 1e-12
-    # Minimise the norm of I - B diag(x) Bᵀ - 11ᵀ/A with the oriented incidence matrix B.
+    # Minimise the norm of I - B diag(x) Bᵀ - 11ᵀ/A with the oriented incidence matrix
+    # B.
     forward = np.flatnonzero(graph.receivers < graph.senders)
     numbers = range(forward.size)
     incidence = np.zeros((graph.n_agents, forward.size))

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from distfilt.sensors import Sensor, bearing, wrap
 from tests.support import NAN, generator
 
-# A full matrix without symmetry, so that a transposed factor would have another covariance.
+# A full matrix without symmetry, so that a transposed factor would have another
+# covariance.
 FULL = np.array([[4.0, 1.2, -0.6], [1.2, 1.0, 0.3], [-0.6, 0.3, 0.5]])
 
 
@@ -130,8 +131,8 @@ def test_jacobian_without_a_formula() -> None:
 def test_a_transposed_derivative_warns_and_a_rough_one_does_not() -> None:
     """h(x) = Q |x| has the derivative Q for positive x.
 
-    Five percent off is close enough. So is any slope at 1e-9 from the bend of |x|, where the
-    differences themselves depend on their step.
+    Five percent off is close enough. So is any slope at 1e-9 from the bend of |x|,
+    where the differences themselves depend on their step.
     """
     turn = np.array([[0.8, 0.6], [-0.6, 0.8]])
     cases = ((1.0, 1.05 * turn, 0), (1.0, turn.T, 1), (1e-9, turn, 0))

@@ -65,8 +65,8 @@ def test_coefficients_and_moments_give_the_same_map() -> None:
     offset = np.linalg.solve(s.scale, s.gain @ s.observed_mean - s.mean)
     rows = np.hstack([offset[:, None], coefficients])
     # About any y, here another than the mean.
-    again = affine.from_rows(rows, np.array([5.0, -3.0]))
-    assert np.allclose(again(y, x), s(y, x), atol=1e-7)
+    by_rows = affine.from_rows(rows, np.array([5.0, -3.0]))
+    assert np.allclose(by_rows(y, x), s(y, x), atol=1e-7)
 
 
 # ------------------------------------------------------------------------ the convex program

@@ -108,16 +108,16 @@ def test_a_lost_spread_warns() -> None:
     """Members that coincide have equal weights: only the observation shows that they are wrong."""
     x = MEAN + 1e-3 * (members(40) - MEAN)
     h = x @ H.T
-    near = x.mean(axis=0) @ H.T
+    predicted_mean = x.mean(axis=0) @ H.T
     std = np.sqrt(np.diagonal(R))
     # Three deviations are no reason to warn.
-    etpf(x, h, near + 3 * std, R, rng=rng_of())
+    etpf(x, h, predicted_mean + 3 * std, R, rng=rng_of())
     far = 6 * std
     distance = far @ np.linalg.solve(R, far)
     message = rf"squared distance .* is {distance:.0f}, not 2;"
     # Of two ensembles the second one is far from its observation.
     with pytest.warns(ParticleCollapse, match=message):
-        etpf([x, x], [h, h], [near, near + far], R, rng=rng_of())
+        etpf([x, x], [h, h], [predicted_mean, predicted_mean + far], R, rng=rng_of())
 
 
 def test_nothing_is_drawn_without_rejuvenation() -> None:

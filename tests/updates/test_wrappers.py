@@ -284,11 +284,14 @@ def test_a_single_observation_is_localised_by_a_tapered_gain() -> None:
     covariance = np.cov(x.T)
     gain = rho * covariance[:, 0] / (covariance[0, 0] + 0.5)
 
-    def seeded(*data: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def update_with_seed(*data: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         return updates.enkf(*data, rng=np.random.default_rng(3))
 
     local = updates.with_localization(
-        seeded, places=places, observation_places=observation_places, radius=2.0
+        update_with_seed,
+        places=places,
+        observation_places=observation_places,
+        radius=2.0,
     )
     analysis = local(x, x[:, :1], [1.0], [[0.5]], rng=rng())
     expected = x + (1.0 - x[:, :1] - zeta) * gain
