@@ -7,25 +7,17 @@ place of covariances.
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from scipy.linalg.lapack import dposv, dpotrf, dtrtrs
 
-from .validation import Array, PositiveSemidefinite, call_user, validated
-from .validation.first_use import is_first_use
+from .validation import Array, PositiveSemidefinite, validated
 
 __all__ = ["SolverError", "factor"]
 
 EPS = float(np.finfo(np.float64).eps)
-# Step of central differences: about the cube root of EPS, where truncation and rounding balance.
-_STEP = 6e-6
-# Steps below this are not refined further.
-_SMALLEST_STEP = 1e-10
 # Matrices up to this size are solved faster by substitution in numpy, if there are many.
 _SMALL = 12
 # Numbers in one block of small systems: half a megabyte stays in the cache.
@@ -320,117 +312,18 @@ def log_sum_exp(logs: Array) -> Array:
         return np.asarray(top + np.log(total))
 
 
+def deviations(cov: Array) -> Array:
+    """Return the standard deviations (..., d) of covariances (..., d, d).
+
+    >>> deviations(np.diag([4.0, 0.0]))
+    array([2., 0.])
+    """
+    # A variance may be negative by rounding.
+    return np.asarray(np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1).clip(0.0)))
+
+
 def to_unit_variances(cov: Array) -> tuple[Array, Array]:
     """Scale covariances to unit variances; also return the standard deviations, 1 of a constant."""
     std = np.sqrt(np.abs(np.diagonal(cov, axis1=-2, axis2=-1)))
     unit = np.where(std > 0, std, 1.0)
     return cov / (unit[..., :, None] * unit[..., None, :]), unit
-
-
-def central_difference(
-    function: Callable[[Array], Array],
-    x: Array,
-    difference: Callable[[Array, Array], Array] = np.subtract,
-    *,
-    step: float = _STEP,
-) -> Array:
-    """Derivative (..., m, d) by central differences, all 2 d shifted states in two calls.
-
-    Its error is about 1e-10 of the function's scale. Where the function bends within a step, the
-    derivative is taken again with steps a hundred times as small.
-
-    Parameters
-    ----------
-    function : callable
-        ``function(x) -> y`` on (..., d) to (..., m).
-    x : ndarray, (..., d)
-        States at which the derivative is taken.
-    difference : callable
-        ``difference(ahead, behind)``, for values that wrap; subtraction by default.
-    step : float
-        Step of each component, relative to its size where that is above 1.
-
-    Examples
-    --------
-    >>> central_difference(lambda x: x**2, np.array([1.0, 3.0])).round(8)
-    array([[2., 0.],
-           [0., 6.]])
-    """
-    h = step * np.maximum(1.0, np.abs(x))
-    steps = h[..., None] * np.eye(x.shape[-1])
-    ahead = x[..., None, :] + steps
-    behind = x[..., None, :] - steps
-    # After rounding the true step is the difference of the two states.
-    true_steps = np.diagonal(ahead - behind, axis1=-2, axis2=-1)
-    f_ahead = call_user(function, ahead)
-    f_behind = call_user(function, behind)
-    f_centre = call_user(function, x[..., None, :])
-    change = call_user(difference, f_ahead, f_behind)
-
-    # Second differences f(x + h) - 2 f(x) + f(x - h) vanish where the function is straight.
-    upper_half = call_user(difference, f_ahead, f_centre)
-    lower_half = call_user(difference, f_behind, f_centre)
-    bend = np.abs(upper_half + lower_half).max(axis=-1)
-    largest_change = np.abs(change).max(axis=-1)
-    rounding = 1e-9 * np.abs(f_centre).max(axis=-1)
-    is_bent = bend > 1e-2 * largest_change + rounding
-
-    slope = change / true_steps[..., None]
-    if step > _SMALLEST_STEP and is_bent.any():
-        finer = central_difference(function, x, difference, step=1e-2 * step)
-        slope = np.where(is_bent[..., None], finer.mT, slope)
-    return np.asarray(slope.mT)
-
-
-def evaluate_derivative(
-    owner: Any,
-    args: tuple[Any, ...],
-    shape: tuple[int, ...],
-    differences: Callable[..., Array],
-    static: Array | float = 0.0,
-) -> Array:
-    """Call an owner's `derivative`, or take differences if it has none; return (..., m, d).
-
-    The first time the derivative is compared with differences, since a transposed one may have the
-    right shape too. Rows may be a tenth of their largest entry off, and may lack entries that are
-    negligible beside the other rows.
-
-    Parameters
-    ----------
-    owner : FrozenModel
-        The object with the derivative; one that the library constructed is trusted.
-    args, shape : tuple
-        Arguments of the derivative, whose arrays are copied, and the shape of the result.
-    differences : callable
-        ``differences(step=step)`` by :func:`central_difference`. Rows that depend on the step are
-        not compared.
-    static : ndarray, optional
-        The derivative of a state that does not change; it is subtracted before comparing.
-    """
-    if owner.derivative is None:
-        return differences()
-    copies = [np.copy(x) if np.ndim(x) else x for x in args]
-    slope = np.asarray(call_user(owner.derivative, *copies))
-    if slope.shape not in (shape, shape[-2:]):
-        raise ValueError(f"derivative must return shape {shape}, got {slope.shape}")
-    if is_first_use(owner, "derivative"):
-        reference = differences(step=_STEP)
-        if _contradicts(slope, reference, differences(step=4 * _STEP), static):
-            warnings.warn(
-                "derivative does not match finite differences of its function",
-                RuntimeWarning,
-                4,
-            )
-    return np.broadcast_to(slope, shape)
-
-
-def _contradicts(
-    slope: Array, reference: Array, coarse: Array, static: Array | float
-) -> bool:
-    """Whether a derivative differs from differences that do not depend on their step."""
-    row_size = np.abs(reference - static).max(axis=-1, keepdims=True)
-    step_error = np.abs(reference - coarse).max(axis=-1, keepdims=True)
-    is_reliable = step_error <= 1e-2 * row_size
-    bound = 0.1 * row_size + 1e-4 * row_size.max(axis=-2, keepdims=True)
-    is_off = np.abs(slope - reference) > bound
-    return bool((is_reliable & is_off).any())

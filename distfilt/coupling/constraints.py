@@ -13,7 +13,8 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ..ensembles import Ensemble
-from ..linalg import SolverError, central_difference, evaluate_derivative
+from ..derivatives import difference_with_error, evaluate_derivative
+from ..linalg import SolverError
 from ..validation import (
     Array,
     ArrayInput,
@@ -91,7 +92,7 @@ class Constraint(FrozenModel):
     def jacobian(self, x: Annotated[ArrayInput, "... d"]) -> Array:
         """Return the derivative of g at states (..., d), (..., s, d)."""
         shape = (*x.shape[:-1], self.value.size, x.shape[-1])
-        differences = partial(central_difference, self.violation, x)
+        differences = partial(difference_with_error, self.violation, x)
         return evaluate_derivative(self, (x,), shape, differences)
 
 

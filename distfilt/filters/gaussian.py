@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 
 from ..gaussians.single import condition, unscented_points
-from ..linalg import EPS, cholesky, solve_upper, symmetrise
+from ..linalg import EPS, cholesky, deviations, solve_upper, symmetrise
 from ..models import LinearModel
 from ..validation import Array, Bounds, NonNegativeFloat, PositiveInt
 from .base import SensorFilter
@@ -213,7 +213,7 @@ class GaussianFilter(
         d = state.dim
         mean, slope, extra = self._linearize(
             partial(model.step, t=state.t, dt=dt),
-            partial(model.jacobian, t=state.t, dt=dt),
+            partial(model.jacobian, t=state.t, dt=dt, std=deviations(state.covariances)),
             state.means,
             state.covariances,
             isinstance(model, LinearModel),
@@ -282,14 +282,15 @@ class GaussianFilter(
         mean = joint_mean[..., block]
         cov = joint_cov[..., block, block]
         linear = group.linear
+        jacobian = partial(group.jacobian, std=deviations(cov))
         predicted, slope, extra = self._linearize(
-            group.predict, group.jacobian, mean, cov, linear
+            group.predict, jacobian, mean, cov, linear
         )
 
         def moments_on_one_branch(_: Array) -> tuple[Array, Array]:
             """Return the moments about one branch, whatever the observed angle is."""
             predict = partial(group.predict, same_branch=True)
-            value, h, rest = self._linearize(predict, group.jacobian, mean, cov, linear)
+            value, h, rest = self._linearize(predict, jacobian, mean, cov, linear)
             return value, h @ cov @ h.mT + rest
 
         group = step.gate(group, moments_on_one_branch, predicted[..., None, :])

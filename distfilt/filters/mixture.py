@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, cast
 
 import numpy as np
 
+from ..linalg import deviations
 from ..mixtures import GaussianMixture, runnalls
 from ..mixtures.conditioning import propagate_mixture, update_mixture, within_gate
 from ..mixtures.splitting import split_nonlinear
@@ -141,9 +142,10 @@ class TargetMixtureFilter(
             return belief
         with step.failing_as(agent):
             if self.split_threshold is not None:
+                std = deviations(belief.moments()[1])
                 belief = split_nonlinear(
                     belief,
-                    partial(model.jacobian, t=t, dt=dt),
+                    partial(model.jacobian, t=t, dt=dt, std=std),
                     max_components=self.max_components,
                     split_threshold=self.split_threshold,
                     scale=self.split_scale,

@@ -538,14 +538,18 @@ class Received:
             values[index] = wrapped.swapaxes(-1, -2)
         return predicted
 
-    def jacobian(self, states: Array) -> Array:
-        """Return the derivatives of the observations at states (*runs, G, d), (*runs, G, M, d)."""
+    def jacobian(self, states: Array, std: Array) -> Array:
+        """Return the derivatives of the observations at states (*runs, G, d), (*runs, G, M, d).
+
+        `std` holds the standard deviations of the states' components, (*runs, G, d).
+        """
         d = states.shape[-1]
         if self.linear:
             return np.full((*self.target.shape, d), self.H(d))
         result = np.empty((*self.target.shape, d))
         for part in self.parts:
-            slope = part.sensor.jacobian(states[..., part.agents, :])
+            rows = (..., part.agents, slice(None))
+            slope = part.sensor.jacobian(states[rows], std=std[rows])
             result[(..., *part.cells, slice(None))] = slope
         return result
 

@@ -12,7 +12,8 @@ from typing import Annotated
 
 import numpy as np
 
-from ..linalg import central_difference
+from ..derivatives import central_difference
+from ..linalg import deviations
 from ..models import Model
 from ..models.quaternions import left_directions, rotate, rotation_vector_between
 from ..sensors import Sensor, stack
@@ -236,7 +237,10 @@ def _predict(
     _check_finite(forecast)
     projection = chart.tangent_projection(forecast)
     # Transition of the errors: A = B(x')⁺ J B(x)
-    a = projection @ model.jacobian(x, t, dt) @ chart.tangent_basis(x)
+    basis = chart.tangent_basis(x)
+    # Standard deviations of the state, from those of its error
+    std = deviations(basis @ p @ basis.mT)
+    a = projection @ model.jacobian(x, t, dt, std=std) @ basis
     noise_cov = projection @ model.Q(t, dt) @ projection.mT
     cov = a @ p @ a.mT + noise_cov
     if not sensor.uses_previous:
@@ -259,7 +263,7 @@ def _assimilate(
     missing = np.isnan(innovation)
     # Missing components have no innovation and no row in H.
     innovation = np.where(missing, 0.0, innovation)
-    h = _error_jacobian(forecast, previous, sensor, chart)
+    h = _error_jacobian(forecast, cov, previous, sensor, chart)
     h = np.where(missing[..., None], 0.0, h)
     error, cov, log_density = assimilate(
         cov, innovation[..., None], h, sensor.noise_cov, missing
@@ -278,10 +282,18 @@ def _check_finite(x: Array) -> None:
 
 
 def _error_jacobian(
-    x: Array, previous: Array | None, sensor: Sensor, chart: QuaternionChart
+    x: Array,
+    cov: Array,
+    previous: Array | None,
+    sensor: Sensor,
+    chart: QuaternionChart,
 ) -> Array:
     """Derivative of a sensor in the errors, (R, m, k); (R, m, 2k) with those of previous states."""
-    h = sensor.jacobian(x, previous) @ chart.tangent_basis(x)
+    basis = chart.tangent_basis(x)
+    # The present errors come first in a joint covariance.
+    k = chart.error_dim
+    std = deviations(basis @ cov[..., :k, :k] @ basis.mT)
+    h = sensor.jacobian(x, previous, std=std) @ basis
     if previous is None:
         return np.asarray(h)
 

@@ -129,7 +129,7 @@ def filterpy_ekf(
         t = float(clock[k])
         dt = float(clock[k + 1] - clock[k])
         # The linearisation is about the last analysis mean.
-        kf.F = model.jacobian(kf.x, t, dt)
+        kf.F = model.jacobian(kf.x, t, dt, std=deviations(kf.P))
         kf.Q = model.Q(t, dt)
         forecast = model.step(kf.x, t, dt)
         kf.predict()
@@ -139,7 +139,7 @@ def filterpy_ekf(
             # The observation is the residual, which the sensor wraps, and its prediction zero.
             # Wrapped where the sensor wraps
             residual = sensor.residual(z, sensor.predict(forecast))[present]
-            h = sensor.jacobian(forecast)[present]
+            h = sensor.jacobian(forecast, std=deviations(kf.P))[present]
             noise_cov = sensor.noise_cov[np.ix_(present, present)]
             kf.update(residual, lambda x: h, lambda x: 0 * residual, noise_cov)
 

@@ -11,7 +11,8 @@ from typing import Annotated
 
 import numpy as np
 
-from ..linalg import central_difference, evaluate_derivative, factor
+from ..derivatives import difference_with_error, evaluate_derivative
+from ..linalg import factor
 from ..validation import (
     Array,
     Bounds,
@@ -129,20 +130,39 @@ class Model(FrozenModel):
 
     @validated
     def jacobian(
-        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat
+        self,
+        x: Annotated[Array, "... self.dim"],
+        t: float,
+        dt: NonNegativeFloat,
+        *,
+        std: Annotated[Array, "... self.dim"] | None = None,
     ) -> Array:
         """Derivative of a step from states (..., d), as (..., d, d).
 
         `derivative` where the model has it, central differences of `transition` otherwise.
+        `std` holds the standard deviations of the states' components, (..., d), which filters
+        hand over: where differences over short steps are spoilt by rounding, longer ones, up
+        to about these, take their place.
+
+        >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+        >>> still.jacobian([1e9], 0.0, 1.0, std=[10.0]).round(6)
+        array([[1.]])
         """
 
         def move(states: Array) -> Array:
             return self.step(states, t, dt)
 
-        differences = partial(central_difference, move, x)
+        differences = partial(difference_with_error, move, x, scale=std)
         shape = (*x.shape, self.dim)
         return evaluate_derivative(
-            self, (x, t, dt), shape, differences, np.eye(self.dim)
+            self,
+            (x, t, dt),
+            shape,
+            differences,
+            np.eye(self.dim),
+            name="transition",
+            scale=std,
+            tolerance=std,
         )
 
 
@@ -259,7 +279,12 @@ class LinearModel(Model):
 
     @validated
     def jacobian(
-        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat
+        self,
+        x: Annotated[Array, "... self.dim"],
+        t: float,
+        dt: NonNegativeFloat,
+        *,
+        std: Annotated[Array, "... self.dim"] | None = None,
     ) -> Array:
         """Derivative of a step, the same matrix for all states, as (..., d, d)."""
         return np.full((*x.shape, self.dim), self.F(dt))

@@ -16,7 +16,8 @@ from typing import Annotated
 
 import numpy as np
 
-from ..linalg import broadcast_leading, central_difference, evaluate_derivative, factor
+from ..derivatives import difference_with_error, evaluate_derivative
+from ..linalg import broadcast_leading, factor
 from ..validation import (
     ALLOW_NAN,
     Array,
@@ -232,11 +233,20 @@ class Sensor(FrozenModel):
         self,
         x: Annotated[Array, "... d"],
         previous: Annotated[Array, "... d"] | None = None,
+        *,
+        std: Annotated[Array, "... d"] | None = None,
     ) -> Array:
         """Return the derivative of h in the present states (..., d), as (..., m, d).
 
         By `derivative` if the sensor has it, by central differences otherwise. NaN
-        where the state cannot be seen.
+        where the state cannot be seen. `std` holds the standard deviations of the
+        states' components, (..., d), which filters hand over: where differences over
+        short steps are spoilt by rounding, longer ones, up to about these, take their
+        place. If none serves, a warning is given once.
+
+        >>> offset = Sensor(1, lambda x: 2e7 + x, [[9.0]])
+        >>> offset.jacobian([0.0], std=[1e6]).round(9)
+        array([[1.]])
         """
         states = self._arguments(x, previous)
         d = x.shape[-1]
@@ -253,5 +263,15 @@ class Sensor(FrozenModel):
         def vary(varied: Array) -> Array:
             return predict(varied, *fixed)
 
-        differences = partial(central_difference, vary, states[0], self.residual)
-        return evaluate_derivative(self, states, shape, differences)
+        differences = partial(
+            difference_with_error, vary, states[0], self.residual, scale=std
+        )
+        return evaluate_derivative(
+            self,
+            states,
+            shape,
+            differences,
+            name="h",
+            scale=std,
+            tolerance=np.sqrt(self.noise_cov.diagonal()),
+        )

@@ -64,8 +64,8 @@ def update(function: F) -> F:
         ``function(ensemble, predicted, observed, noise, *, rng, …)`` for float64 arrays that fit,
         with a noise covariance for each ensemble or one for all. Annotations of its options are
         checked too, as :mod:`distfilt.validation` describes. In a filter whose runs miss different
-        components, every run has normal draws of its own if they are drawn for all members at
-        once.
+        components, every run has draws of its own, of any distribution of numpy's, if they are
+        drawn for all runs at once: if the first axes of their shape are those of the ensemble.
 
     Returns
     -------
@@ -311,13 +311,14 @@ def _stream(
 
 
 class RowGenerator(Rng):
-    """A generator of normal draws for a batch (*lead) that returns those of some rows.
+    """A generator for a batch (*lead) that returns the draws of some of its rows.
 
-    `rows` are flat indices into the batch. So two ensembles that miss different components have
-    different draws:
+    `rows` are flat indices into the batch. Draws of any distribution are made for the whole
+    batch if they have an entry for each row. So two ensembles that miss different components
+    have different draws:
 
     >>> def add_noise(x, h, y, r, *, rng):
-    ...     return x + rng.normal(size=x.shape)
+    ...     return x + rng.laplace(size=x.shape)
     >>> observed = np.array([[1.0, np.nan], [np.nan, 1.0]])
     >>> a, b = with_missing(
     ...     add_noise,
@@ -337,16 +338,125 @@ class RowGenerator(Rng):
         self.rows = rows
         self.is_partial = rows.size != math.prod(lead)
 
-    def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
-        """Draw as numpy does, by standard normal draws."""
-        return loc + scale * self.standard_normal(size)
+    def permuted(self, x: Any, *, axis: int | None = None, out: Any = None) -> Any:
+        """Permute as numpy does, the slices of each row by draws of the row's own."""
+        values = np.asarray(x)
+        if not self._has_rows(values.shape) or axis is None:
+            return super().permuted(x, axis=axis, out=out)
+        # The other rows' slices only take their draws.
+        whole = self._fill_batch(values).reshape(-1, *values.shape[1:])
+        mixed = super().permuted(whole, axis=axis)[self.rows]
+        if out is None:
+            return mixed
+        out[...] = mixed
+        return out
 
-    def standard_normal(self, size: Any = None, *args: Any, **options: Any) -> Any:
-        """Draw as numpy does, for the whole batch, and return the draws of the rows."""
-        shape = tuple(size) if np.iterable(size) else ()
-        # Only draws with an entry for each row can be selected by row.
-        if not self.is_partial or shape[:1] != self.rows.shape:
-            return super().standard_normal(size, *args, **options)
-        row_shape = shape[1:]
-        draws = super().standard_normal((*self.lead, *row_shape), *args, **options)
-        return draws.reshape(-1, *row_shape)[self.rows]
+    def _has_rows(self, shape: tuple[int, ...]) -> bool:
+        """Whether rows have to be selected from draws of a shape with an entry for each."""
+        return self.is_partial and shape[:1] == self.rows.shape
+
+    def _fill_batch(self, values: Array) -> Array:
+        """Return values of the rows (n, ...) in their places of the batch, (*lead, ...)."""
+        # The other rows get valid values, those of the first row.
+        whole = np.repeat(values[:1], math.prod(self.lead), axis=0)
+        whole[self.rows] = values
+        return whole.reshape(*self.lead, *values.shape[1:])
+
+    def _spread(self, parameter: Any, n_axes: int) -> Any:
+        """Return a parameter of draws with so many axes as one for the whole batch."""
+        values = np.asarray(parameter)
+        # A parameter without an axis of rows is that of all rows.
+        if values.ndim < n_axes:
+            return parameter
+        if len(values) == 1:
+            return values.reshape((1,) * len(self.lead) + values.shape[1:])
+        return self._fill_batch(values)
+
+
+_PARAMETERS: dict[str, tuple[str, ...]] = {
+    "beta": ("a", "b"),
+    "binomial": ("n", "p"),
+    "chisquare": ("df",),
+    "exponential": ("scale",),
+    "f": ("dfnum", "dfden"),
+    "gamma": ("shape", "scale"),
+    "geometric": ("p",),
+    "gumbel": ("loc", "scale"),
+    "hypergeometric": ("ngood", "nbad", "nsample"),
+    "integers": ("low", "high"),
+    "laplace": ("loc", "scale"),
+    "logistic": ("loc", "scale"),
+    "lognormal": ("mean", "sigma"),
+    "logseries": ("p",),
+    "negative_binomial": ("n", "p"),
+    "noncentral_chisquare": ("df", "nonc"),
+    "noncentral_f": ("dfnum", "dfden", "nonc"),
+    "normal": ("loc", "scale"),
+    "pareto": ("a",),
+    "poisson": ("lam",),
+    "power": ("a",),
+    "random": (),
+    "rayleigh": ("scale",),
+    "standard_cauchy": (),
+    "standard_exponential": (),
+    "standard_gamma": ("shape",),
+    "standard_normal": (),
+    "standard_t": ("df",),
+    "triangular": ("left", "mode", "right"),
+    "uniform": ("low", "high"),
+    "vonmises": ("mu", "kappa"),
+    "wald": ("mean", "scale"),
+    "weibull": ("a",),
+    "zipf": ("a",),
+}
+"""The parameters of each distribution of numpy whose draws are numbers, before ``size``."""
+_EVENTS: dict[str, tuple[str, ...]] = {
+    "choice": ("a",),
+    "dirichlet": ("alpha",),
+    "multinomial": ("n", "pvals"),
+    "multivariate_hypergeometric": ("colors", "nsample"),
+    "multivariate_normal": ("mean", "cov"),
+}
+"""The same for draws that are vectors, or are made from a list: all rows share parameters."""
+
+
+def _draw_rows(name: str, parameters: tuple[str, ...], by_row: bool) -> Any:
+    """Return the method of a distribution that draws for the batch and selects the rows."""
+    draw = getattr(np.random.Generator, name)
+    names = (*parameters, "size")
+
+    def method(self: RowGenerator, *args: Any, **options: Any) -> Any:
+        bound = dict(zip(names, args, strict=False)) | options
+        size = bound.get("size")
+        if size is None and by_row and bound.get("out") is None:
+            # Without a size it is that of the parameters.
+            given = [np.shape(bound[p]) for p in parameters if p in bound]
+            shape = np.broadcast_shapes(*given)
+        else:
+            shape = tuple(size) if np.iterable(size) else ()
+        if not self._has_rows(shape) or len(args) > len(names):
+            return draw(self, *args, **options)
+        if by_row:
+            for p in parameters:
+                if bound.get(p) is not None:
+                    bound[p] = self._spread(bound[p], len(shape))
+        bound["size"] = (*self.lead, *shape[1:])
+        out = bound.pop("out", None)
+        # As many positional arguments as numpy needs: some have no names.
+        draws = draw(self, **bound)
+        n_rows = math.prod(self.lead)
+        selected = draws.reshape(n_rows, *draws.shape[len(self.lead) :])[self.rows]
+        if out is None:
+            return selected
+        out[...] = selected
+        return out
+
+    method.__name__ = name
+    method.__doc__ = f"Draw as numpy's `{name}` does, and return the draws of the rows."
+    return method
+
+
+for _name, _parameters in _PARAMETERS.items():
+    setattr(RowGenerator, _name, _draw_rows(_name, _parameters, True))
+for _name, _parameters in _EVENTS.items():
+    setattr(RowGenerator, _name, _draw_rows(_name, _parameters, False))

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from distfilt.linalg import central_difference
+from distfilt.derivatives import central_difference
 from distfilt.models import cross_matrix, quaternion_rate, rotation_matrix
 from distfilt.models.quaternions import (
     left_directions,

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from distfilt import sensors
-from distfilt.linalg import central_difference
+from distfilt.derivatives import central_difference
 from distfilt.models import occulted
 from distfilt.sensors import (
     Sensor,
