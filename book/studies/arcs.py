@@ -125,7 +125,9 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         ]
         for name, (terms, rule) in RULES.items()
     }
-    fused["moments"] = [fuse_moments(fusion.prior, fusion.received) for fusion in fusions]
+    fused["moments"] = [
+        fuse_moments(fusion.prior, fusion.received) for fusion in fusions
+    ]
     # All rules are compared on the same points.
     first_seed = int(for_points.integers(2**31))
     columns = {}
