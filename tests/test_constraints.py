@@ -166,6 +166,7 @@ def test_shapes_are_bound_by_arguments_fields_and_paths() -> None:
     ) -> tuple[Any, ...]:
         return x, y, z
 
+    # y takes N from x; z takes its first size from an attribute of an argument.
     fits = {
         "x": np.ones((3, 4)),
         "y": np.ones(3),
@@ -179,6 +180,7 @@ def test_shapes_are_bound_by_arguments_fields_and_paths() -> None:
 
 
 def test_frozen_models_copy_and_freeze_arrays_and_construct_does_neither() -> None:
+    # The caller may change its array afterwards.
     cov = np.eye(2)
     line = Line(2, cov, parts=[cov[0]])
     cov[0, 0] = 9.0
@@ -224,6 +226,7 @@ def test_covariances_pass_in_any_units(seed: int, d: int) -> None:
     "rule", [validation.check_positive_definite, validation.check_positive_semidefinite]
 )
 def test_each_matrix_is_checked_in_the_units_of_its_components(rule: Any) -> None:
+    # An error of a small component must not vanish beside a large one.
     hidden = np.diag([1e12, 1.0, 1.0])
     hidden[1, 2] = hidden[2, 1] = 1.1
     for cov, words in (

@@ -46,6 +46,7 @@ def test_draws_have_the_mean_and_the_full_covariance() -> None:
     x = draw([1.0, -2.0, 3.0], FULL, 100, rng=generator(3), leading=(20, 10)).reshape(
         n, 3
     )
+    # Var P̂_ij = (P_ij² + P_ii P_jj) / n of Gaussian draws.
     error = np.sqrt((FULL**2 + np.outer(FULL.diagonal(), FULL.diagonal())) / n)
     assert (np.abs(sample_covariance(x) - FULL) < 5 * error).all()
     assert (np.abs(mean(x) - [1.0, -2.0, 3.0]) < 5 * np.sqrt(FULL.diagonal() / n)).all()
@@ -146,6 +147,7 @@ def test_too_few_members_are_refused_with_the_number_needed() -> None:
 def test_both_ways_give_the_same_draw(monkeypatch: pytest.MonkeyPatch) -> None:
     """Normal equations where they are safe, orthogonal bases where not: one projection."""
     x = generator(8).standard_normal((5, 30, 4)) @ np.diag([1.0, 1e3, 1e-3, 1.0])
+    # The fast way whitens by a Cholesky factor; without one QR takes its place.
     fast = exact_noise(x, factor(FULL), generator(9))
 
     def fails(gram: np.ndarray) -> None:
@@ -164,6 +166,7 @@ def test_exact_noise_is_uniform_over_the_free_directions() -> None:
     noise = exact_noise(np.broadcast_to(x, (20_000, 8, 2)), factor([[4.0]]), rng)[
         ..., 0
     ]
+    # The draws lie in the complement of the constant and of both columns of x.
     basis = np.linalg.qr(np.column_stack([np.ones(8), x]))[0]
     projection = np.eye(8) - basis @ basis.T
     covariance = noise.T @ noise / 20_000

@@ -62,11 +62,13 @@ def test_intersection_is_the_weighted_sum_of_information(
     p = spd(rng, d, (6, s))
     w = rng.dirichlet(np.ones(s), 6)
     fused = intersect_gaussians(m, p, w)
+    # Rounding grows with the condition of the worst covariance.
     exact = _intersect_by_inverses(m, p, w)
     worst = 1e-13 * np.linalg.cond(p).max()
     assert np.abs(fused[0] - exact[0]).max() < 10 * worst
     assert unit_gap(fused[1], exact[1]) < worst
     assert (fused[1] == fused[1].swapaxes(-1, -2)).all()
+    # A batch is the same as its members, and leading axes broadcast.
     one = intersect_gaussians(m[2], p[2], w[2])
     assert np.allclose(one[0], fused[0][2], atol=worst) and np.allclose(
         one[1], fused[1][2]
@@ -94,6 +96,7 @@ def test_intersection_does_not_depend_on_units_or_order() -> None:
     m = rng.standard_normal((3, 4))
     p = spd(rng, 4, (3,))
     w = np.array([0.2, 0.5, 0.3])
+    # Weights and result belong to the sources, in any units.
     size = np.array([1e-9, 1.0, 1e9, 1e3])
     plain = intersect_gaussians(m, p, w)
     scaled = intersect_gaussians(m * size, p * np.outer(size, size), w)
@@ -153,6 +156,7 @@ def test_an_absent_source_has_weight_zero_for_any_values(rule: str) -> None:
 def test_closed_forms() -> None:
     p = np.stack([np.diag([1.0, 4.0]), np.diag([9.0, 1.0]), [[2.0, 1.0], [1.0, 2.0]]])
     assert np.allclose(intersection_weights(p), THIRDS, rtol=1e-15)
+    # Inverse traces, and inverse d-th roots of the determinants.
     traces = np.array([1 / 5, 1 / 10, 1 / 4])
     assert np.allclose(
         intersection_weights(p, rule="trace"), traces / traces.sum(), rtol=1e-14
@@ -193,6 +197,7 @@ def test_optimal_weights_meet_the_conditions_of_the_optimum(
     rng = generator(seed)
     p = spd(rng, d, (s,)) * np.exp(spread * rng.standard_normal((s, 1, 1)))
     w = intersection_weights(p, rule=rule)
+    # g_b ≤ Σ ω g, with equality where ω_b > 0 (Karush, Kuhn and Tucker).
     slopes = _slopes(w, p, rule)
     average = float(w @ slopes)
     assert slopes.max() <= (1 + 2e-7) * average
@@ -316,6 +321,7 @@ def test_matching_moments_is_symmetric_and_so_optimal_transport() -> None:
     other = _ensembles(2, 40, 4)
     cov = sample_covariance(other)
     unit = np.sqrt(cov.diagonal())
+    # The map A of the anomalies, from their least squares, is symmetric positive definite.
     a = np.linalg.lstsq(
         e - mean(e), match_moments(e, mean(e), cov) - mean(e), rcond=None
     )[0].T
@@ -364,6 +370,7 @@ def test_points_have_the_moments(d: int, kappa: float) -> None:
     root = np.linalg.cholesky(cov) @ np.linalg.qr(rng.standard_normal((d, d)))[0]
     points, w = unscented_points(mean, root, kappa=kappa)
     assert points.shape == (4, 2 * d + 1, d) and np.isclose(w.sum(), 1)
+    # Σ w x = m and Σ w (x - m)(x - m)ᵀ = P, for any square root.
     assert np.allclose(w @ points, mean)
     innovation = points - mean[:, None]
     assert np.allclose((innovation * w[:, None]).mT @ innovation, cov)
@@ -374,6 +381,7 @@ def test_points_have_the_moments(d: int, kappa: float) -> None:
 
 def test_fourth_moments_along_an_axis_are_a_gaussians() -> None:
     points, w = unscented_points(np.zeros(4), np.eye(4), kappa=-1.0)
+    # E z⁴ = 3 and E z³ = 0 with κ = 3 - d.
     assert np.allclose(w @ points**4, 3.0) and np.allclose(w @ points**3, 0.0)
 
 
@@ -400,6 +408,7 @@ def case(seed: int, lead: tuple[int, ...] = ()) -> tuple[np.ndarray, ...]:
 def test_in_information_form_an_update_is_a_sum(seed: int) -> None:
     mean, cov, innovation, h, r = case(seed)
     x, p = condition(mean, cov, innovation, h, r)
+    # P⁺⁻¹ = P⁻¹ + Hᵀ R⁻¹ H and m⁺ = m + P⁺ Hᵀ R⁻¹ d
     weight = h.T @ np.linalg.inv(r)
     exact = np.linalg.inv(np.linalg.inv(cov) + weight @ h)
     np.testing.assert_allclose(p, exact, rtol=1e-8, atol=1e-9)

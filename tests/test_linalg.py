@@ -41,6 +41,7 @@ def _log_det(cov: np.ndarray) -> np.ndarray:
 def test_factor_reproduces_its_matrix(seed: int, d: int) -> None:
     cov = spd(generator(seed), d, (2, 3))
     lower = linalg.factor(cov)
+    # L Lᵀ = P to rounding, triangular with a positive diagonal.
     assert unit_gap(lower @ _transpose(lower), cov) < 10 * d * EPS
     assert (np.triu(lower, 1) == 0).all() and (
         np.diagonal(lower, axis1=-2, axis2=-1) > 0
@@ -90,6 +91,7 @@ def test_factor_is_unique_where_a_component_is_still(
     cov = spd(generator(seed), d)
     cov[k] = cov[:, k] = 0.0
     lower = linalg.factor(cov)
+    # The other components have the Cholesky factor of their own covariance.
     others = np.arange(d) != k
     plain = np.linalg.cholesky(cov[np.ix_(others, others)])
     assert np.allclose(lower[np.ix_(others, others)], plain, rtol=1e-9, atol=1e-12)
@@ -181,6 +183,7 @@ def test_solves_agree_with_numpy(seed: int, d: int, leading: tuple[int, ...]) ->
     rng = generator(seed)
     cov = spd(rng, d, leading)
     v = rng.standard_normal((*leading, d))
+    # vᵀ P⁻¹ v and log |P|, as numpy's general routines give them.
     worst = 1e-13 * np.linalg.cond(cov).max()
     plain = np.linalg.solve(cov, v[..., None])[..., 0]
     assert np.allclose(_length(cov, v), (v * plain).sum(-1), rtol=worst)

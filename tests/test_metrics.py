@@ -58,6 +58,7 @@ def test_nees_and_nis_are_their_definitions(leading):
 )
 def test_nees_band_has_its_probability(dim, runs, level):
     band = nees_band(dim, runs, level=level)
+    # The sum of n NEES values is chi-square with n d degrees of freedom.
     law = stats.chi2(dim * runs)
     assert law.cdf(band.high * runs) - law.cdf(band.low * runs) == pytest.approx(
         level, abs=1e-10
@@ -80,6 +81,7 @@ def test_nees_band_has_its_probability(dim, runs, level):
 )
 def test_gaussian_crps_equals_its_integral(mean, std, truth):
     cdf = stats.norm(mean, std).cdf
+    # ∫ (F(u) - 1{u ≥ y})² du, below and above the truth y.
     below, _ = quad(lambda u: cdf(u) ** 2, mean - 12 * std, truth, epsabs=1e-12)
     above, _ = quad(lambda u: (1 - cdf(u)) ** 2, truth, mean + 12 * std, epsabs=1e-12)
     assert gaussian_crps(mean, std, truth) == pytest.approx(below + above, abs=1e-9)

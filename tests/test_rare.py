@@ -39,6 +39,7 @@ def test_a_received_belief_may_be_a_million_times_sharper() -> None:
 
 
 def test_a_first_source_without_weight_has_no_influence() -> None:
+    # The first source defines the coordinates of the solution, even with weight zero.
     far = np.full(2, 7e6)
     wide = SHARP + 3e-8 * np.outer(V, V)
     means = [far, far + 10 * U, far - 10 * U]
@@ -121,6 +122,7 @@ def test_derivatives_far_from_the_origin_and_of_small_things() -> None:
 
 
 def test_networks_that_are_uneven_silent_or_without_a_link() -> None:
+    # A hub with 20 links: the eigenvalues lie too close for the product of gains.
     hub = [(0, i) for i in range(1, 21)] + [(i, i + 1) for i in range(1, 20)]
     with pytest.raises(ValueError, match="rounding"):
         network.finite_time_consensus(

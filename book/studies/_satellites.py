@@ -200,22 +200,22 @@ def better_filter(s: Setup, kind: str) -> EnsembleFilter:
             names=s.names,
             on_error="keep",
         )
-    rule, agreement = {
+    update_rule, fusion = {
         "sampled_fused": (enkf_sampled_covariance, fuse),
         "known_pulled": (enkf, partial(mean_pull, **s.pull)),
         "known_fused": (enkf, fuse),
         "known_best": (enkf, partial(intersect_ensembles, rule="min_determinant")),
     }[kind]
-    return _make_filter(s, rule, agreement)
+    return _make_filter(s, update_rule, fusion)
 
 
-def _make_filter(s: Setup, rule: Any, agreement: Any) -> EnsembleFilter:
+def _make_filter(s: Setup, update_rule: Any, fusion: Any) -> EnsembleFilter:
     return EnsembleFilter(
         s.model,
         s.sensors,
         s.graph,
-        update=rule,
-        fusion=agreement,
+        update=update_rule,
+        fusion=fusion,
         members=s.members,
         names=s.names,
         on_error="keep",

@@ -99,6 +99,7 @@ def make_filter(
     scheme: str, case: Case, local: int | Sequence[int] = LOCAL, **options: Any
 ) -> DensityFilter:
     """Return a scheme's filter with the scenario's choices."""
+    # The filters believe in f turned by the case's phase.
     protocol, scheme_options = SCHEMES[scheme]
     model = density.FokkerPlanck(densities.swarm(case.reading, case.phase), case.grid)
     agents = tuple(range(local)) if isinstance(local, int) else tuple(local)
@@ -120,6 +121,7 @@ def make_filter(
 def draw_swarm(case: Case, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Draw agents (N, 2); return them and their density on the case's grid."""
     x = densities.first_agents(case.start, case.agents, rng)
+    # The density is given on the scenario's grid; the case's cells take the nearest value.
     first = densities.first_density(case.start)
     return x, case.grid.normalize(first[densities.grid().cell_index(case.grid.centres)])
 
@@ -150,6 +152,7 @@ def compare_filters(
         ]
     )
     columns: dict[str, list[Any]] = {}
+    # The last agents are those that drop out.
     leaving = np.arange(case.agents) >= round((1 - case.gone) * case.agents)
     for j in range(round(case.end / dt)):
         # The agents, the true density and the open loops move.
@@ -165,6 +168,7 @@ def compare_filters(
             callback((j + 1) * dt, x, p, states)
         if (j + 1) % every:
             continue
+        # The kernel estimate of an observer of all present agents
         y = density.kernel_density(
             x[~(leaving & after)], cells, bandwidth=case.bandwidth
         )

@@ -110,7 +110,9 @@ class Team:
         cov = np.broadcast_to(first, (runs, self.size, *first.shape))
         beliefs = []
         for k in range(steps):
+            # m⁻ = F m and P⁻ = F P Fᵀ + Q
             before = mean @ move.T, move @ cov @ move.T + noise
+            # Each agent conditions on its own observation, then on the messages that arrive.
             after = condition(
                 *before, self.sees(0, 1), self.reading_cov, seen[k], self.gate
             )
@@ -168,7 +170,9 @@ def condition(
     """Return Gaussians after observations y of h; one outside the gate is ignored."""
     gap = (y - mean @ h.T)[..., None]
     spread = h @ cov @ h.T + r
+    # K = P Hᵀ S⁻¹, by a solve
     gain = np.linalg.solve(spread, h @ cov).mT
+    # The squared normalized innovation has a chi-squared distribution.
     if gate is not None:
         far = (gap.mT @ np.linalg.solve(spread, gap))[..., 0, 0]
         gain = gain * (far <= chi2.ppf(gate, len(h)))[..., None, None]
@@ -207,6 +211,7 @@ def intersect_beliefs(
 ) -> Belief:
     """Intersect the targets' covariances, with equal weights of the beliefs that arrive."""
     vector, matrix = information(*after, n)
+    # Row i has equal weights of the beliefs that agent i has.
     w = arrived + np.eye(arrived.shape[-1])
     w = w / w.sum(axis=-1, keepdims=True)
     fused = np.einsum("rij,rjn->rin", w, vector), np.einsum("rij,rjmn->rimn", w, matrix)

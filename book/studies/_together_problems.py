@@ -141,12 +141,14 @@ def ranges(s: Scenario = RANGE, agents: int | None = None) -> Problem:
     agents = agents or s["agents"]
     rate = s["turn_rate"]
     q = s["process_std"] ** 2
+    # x(t + dt) = R(ω dt) x(t) + noise of variance q dt
     model = LinearModel.from_transition(
         2,
         lambda dt: rotation(rate * dt),
         lambda t, dt: q * dt * np.eye(2),
         names=PLANE,
     )
+    # The agents stand on a circle about the origin.
     angle = 2 * np.pi * np.arange(agents) / agents
     places = s["radius"] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     std = s["reading_std"]
@@ -245,6 +247,7 @@ def target_and_egos(s: Scenario, agents: int) -> tuple[LinearModel, Array]:
 def relative_position_sensor(s: Scenario, agent: int, agents: int) -> Sensor:
     """Return a sensor of the target's position minus that of one agent."""
     first = 4 + 2 * agent
+    # H x = target - own position
     H = np.zeros((2, 4 + 2 * agents))
     H[:, :2] = np.eye(2)
     H[:, first : first + 2] = -np.eye(2)

@@ -142,6 +142,7 @@ def count_operations(p: Any, cell: str, members: int | None = None) -> float:
     m = count_observed(p, rule, near)
     transition = 400 if "chaotic" in p.traits else 2 * d * d
     fusing = FUSION_FACTORS.get(rule, 0) * (1 + near) * d**3
+    # Covariance forecast 4 d³, update 2 m d (d + m) + m³
     if family in ("ekf", "ukf"):
         rounds = {"two": 2, "meas": p.n_agents / 2}.get(rule, 0)
         averaging = rounds * near * d * d
@@ -150,6 +151,7 @@ def count_operations(p: Any, cell: str, members: int | None = None) -> float:
         return 4 * d**3 + update + fusing + averaging + points
     if family in ("news", "own"):
         return 10 * 6**3 + 4 * near * 4**3
+    # Every pair of components is fused.
     if family == "gm":
         return near * together.STUDY["mixands"] ** 2 * 10 * d**3
     if family == "grid":
@@ -158,6 +160,7 @@ def count_operations(p: Any, cell: str, members: int | None = None) -> float:
     if family == "ot":
         # The network simplex
         return n**3 * np.log2(n)
+    # Each particle moves, is observed, and is weighted.
     if family == "pf":
         terms = 15 if "curved" in p.traits else 10
         consensus = 2 * terms**2 if rule == "agreed" else 0
@@ -250,6 +253,7 @@ def tree(rows: Sequence[Row], depth: int) -> tuple[float, Any]:
     least: tuple[float, Any] = best_leaf(rows)
     if depth == 0 or least[0] < 1e-9:
         return least
+    # Split by the question that lowers the total regret most.
     for question in QUESTIONS:
         yes = tuple(row for row in rows if answer(question, *row))
         no = tuple(row for row in rows if not answer(question, *row))

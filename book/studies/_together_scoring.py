@@ -41,6 +41,7 @@ UNCERTAIN = ("pf_", "ot_", "maps_", "ekf_", "reference", "half", "gm_")
 
 def stream(seed: Seed, name: str) -> np.random.Generator:
     """Return a generator that belongs to a name, whatever else the seed serves."""
+    # The name's checksum extends the spawn key.
     key = (*seed.spawn_key, zlib.crc32(name.encode()))
     return np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=key))
 
@@ -96,6 +97,7 @@ def score_filter(
         for name, values in mean_scores(p, run).items():
             collected[name].append(values)
     result = {name: np.ravel(values) for name, values in collected.items() if values}
+    # Numbers sent by one agent in one step
     sent = run["scalars_total"].values[-1].sum() / p.n_agents / len(p.times)
     return result | {"floats": float(sent)}
 
@@ -235,6 +237,7 @@ def measure_references(
     p: Problem, seed: Seed, data: Data, *, half: bool = True
 ) -> dict[str, float]:
     """Return the references' columns, by default with those of half the effort."""
+    # One agent has the stacked sensor of all.
     one = replace(p, sensors=[p.all_sensors], graph=None, local=None)
     joint = data[0], [np.concatenate(data[1], axis=-1)]
     columns: dict[str, float] = {}
@@ -263,6 +266,7 @@ def measure_cells(name: str, seed: Seed, cells: Iterable[str]) -> dict[str, floa
             continue
         f = CELLS[cell].make(p, tuned_value(name, cell))
         columns |= measure(p, cell, f, data, seed)
+    # Flooding sends the same numbers whatever the filter.
     if "ekf_flood_floats" in columns and p.model.dim == 2:
         columns["grid_flood_floats"] = columns["ekf_flood_floats"]
     return columns

@@ -113,6 +113,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     for_pair, for_points = (np.random.default_rng(s) for s in seed.spawn(2))
     first_belief = draw_belief(np.pi, for_pair)
     second_belief = draw_belief(np.pi + for_pair.uniform(*BOUNDS["turn"]), for_pair)
+    # Each agent receives the other's marginal of the target.
     fusions = [
         PartialFusion(first_belief, second_belief.marginal([0, 1])),
         PartialFusion(second_belief, first_belief.marginal([0, 1])),
@@ -124,7 +125,10 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         ]
         for name, (terms, rule) in RULES.items()
     }
-    fused["moments"] = [fuse_moments(fusion.own, fusion.received) for fusion in fusions]
+    fused["moments"] = [
+        fuse_moments(fusion.prior, fusion.received) for fusion in fusions
+    ]
+    # All rules are compared on the same points.
     first_seed = int(for_points.integers(2**31))
     columns = {}
     for name, pair in fused.items():
@@ -132,7 +136,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
             divergence = jeffreys_by_sampling(
                 mixture.log_density,
                 fusion.log_value,
-                mix(fused["points"][k], fusion.own, 0.8),
+                mix(fused["points"][k], fusion.prior, 0.8),
                 members=MEMBERS,
                 rng=np.random.default_rng(first_seed + k),
             )

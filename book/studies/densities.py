@@ -72,6 +72,7 @@ def first_density(start: str) -> np.ndarray:
 def first_agents(start: str, agents: int, rng: np.random.Generator) -> np.ndarray:
     """Draw agents from it, (N, 2)."""
     cells = grid()
+    # A cell by its probability, then a uniform position in it
     share = first_density(start) * cells.volume
     chosen = cells.centres[rng.choice(cells.size, size=agents, p=share)]
     return chosen + (rng.random((agents, 2)) - 0.5) * cells.spacing
@@ -93,6 +94,28 @@ def estimate_from_positions(basis: np.ndarray, positions: np.ndarray) -> Any:
     return state
 
 
+def prior_basis() -> np.ndarray:
+    """Return the basis of the prior covariance that all filters share."""
+    return density.zero_mean_prior(
+        grid(),
+        rank=CHOICES["rank"],
+        length=CHOICES["prior_length"],
+        std=CHOICES["prior_std"],
+    )
+
+
+def flat_gaussian(position: np.ndarray) -> np.ndarray:
+    """Return a wide Gaussian about one agent, as a density on the grid."""
+    cells = grid()
+    squares = ((cells.centres - position) ** 2).sum(axis=-1)
+    return cells.normalize(np.exp(-0.5 * squares / CHOICES["local_prior_std"] ** 2))
+
+
+def choice(key: str, reading: str) -> Any:
+    """Return a choice of the scenario that depends on the interpretation of (23)."""
+    return dict(zip(READINGS, CHOICES[key], strict=True))[reading]
+
+
 def run_case(
     reading: str,
     start: str,
@@ -107,35 +130,22 @@ def run_case(
     dt = SWARM["dt"]
     n = int(SWARM["agents"]) if agents is None else agents
     h = CHOICES["bandwidth"]
-    end = (
-        dict(zip(READINGS, CHOICES["end_times"], strict=True))[reading]
-        if end is None
-        else end
-    )
+    floor = CHOICES["floor"]
+    end = choice("end_times", reading) if end is None else end
     true = swarm(reading)
-    believed = swarm(reading, phase)
-    truth, model = (density.FokkerPlanck(s, cells) for s in (true, believed))
+    truth = density.FokkerPlanck(true, cells)
+    model = density.FokkerPlanck(swarm(reading, phase), cells)
     k = density.kernel_constant(cells, bandwidth=h, agents=n)
-    # All filters share one basis of the prior covariance.
-    basis = density.zero_mean_prior(
-        cells,
-        rank=CHOICES["rank"],
-        length=CHOICES["prior_length"],
-        std=CHOICES["prior_std"],
-    )
+    basis = prior_basis()
     x = first_agents(start, n, rng)
     p = first_density(start)
     y = density.kernel_density(x, cells, bandwidth=h)
-    flat = np.exp(
-        -0.5
-        * ((cells.centres - x[0]) ** 2).sum(axis=-1)
-        / CHOICES["local_prior_std"] ** 2
-    )
-    filters = initial_filters(basis, np.stack([y, y, y, cells.normalize(flat)]), x)
+    base = np.stack([y, y, y, flat_gaussian(x[0])])
+    filters = initial_filters(basis, base, x)
+    # One more filter of lower rank, with process noise where the model is wrong
     few = basis[:, : CHOICES["low_rank"]]
     low = density.low_rank_start(few, y[None])
-    scale = dict(zip(READINGS, CHOICES["process_scale"], strict=True))[reading]
-    floor = CHOICES["floor"]
+    process = choice("process_scale", reading) * few
     rows = []
     noise = np.full(filters.base.shape, np.inf)
     for j in range(round(end / dt)):
@@ -150,24 +160,15 @@ def run_case(
         noise[0] = k * np.maximum(filters.estimates[0], floor)
         noise[1] = k * np.maximum(y, floor)
         filters = density.low_rank_step(filters, y, noise, dt)
-        # With a wrong model one more filter has process noise.
         if phase:
-            low = density.low_rank_predict(low, move, process=scale * few, dt=dt)
-            low = density.low_rank_step(
-                low, y, k * np.maximum(low.estimates, floor), dt
-            )
+            low = density.low_rank_predict(low, move, process=process, dt=dt)
+            low_noise = k * np.maximum(low.estimates, floor)
+            low = density.low_rank_step(low, y, low_noise, dt)
         estimates = np.stack([y, *filters.estimates, *low.estimates])
-        rows.append(
-            np.concatenate([cells.norm(estimates - p), filter_scores(filters, p, j)])
-        )
-    names = (
-        *EXACT,
-        "process",
-        "filter_nees",
-        "bound_nees",
-        "filter_crps",
-        "bound_crps",
-    )
+        errors = cells.norm(estimates - p)
+        rows.append(np.concatenate([errors, filter_scores(filters, p, j)]))
+    scores = ("filter_nees", "bound_nees", "filter_crps", "bound_crps")
+    names = (*EXACT, "process", *scores)
     return dict(zip(names, np.array(rows).T, strict=True))
 
 
@@ -222,6 +223,8 @@ def trial(seed: np.random.SeedSequence) -> list[float]:
 
 code: tuple[Any, ...] = (
     run_case,
+    prior_basis,
+    flat_gaussian,
     initial_filters,
     estimate_from_positions,
     filter_scores,

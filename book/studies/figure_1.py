@@ -50,6 +50,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         error = result["total_squared_error"].mean("agent").values
         nees = result["nees"].mean("agent").values / SETUP.model.dim
         values |= satellites.time_series(name, error, nees)
+        # The same data with few members
         small = satellites.paper_filter(replace(SETUP, members=FEW), pca=pca)
         result = satellites.run_filter(
             SETUP, small, for_filters, truth, seen, ("squared_error",)

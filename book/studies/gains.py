@@ -82,7 +82,9 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     filters = {s: network(s) for s in (*CENTRALS, *READINGS)}
     run, _ = swarm.compare_filters(CASE, np.random.default_rng(seed), filters)
     half = CASE.end / 2
+    # A twelfth of the run: five seconds
     k = len(run["kde"]) // 12
+    # The kernel estimate's mean error, below which a filter has to stay
     level = float(run["kde"].mean())
     values = {"kde": swarm.average(run["kde"], CASE, half)}
     for s in CENTRALS:
@@ -90,6 +92,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         values[f"{s}_below"] = figure.below(run[f"{s}_error"][:, 0], level)
     for r in READINGS:
         error = run[f"{r}_error"]
+        # Over the centralised filter with the same R and kernel
         ratio = mean_interval(swarm.average(error, CASE, half) / values[own_central(r)])
         falls = mean_interval(error[-k:].mean(axis=0) / error[:k].mean(axis=0))
         values |= {

@@ -61,6 +61,7 @@ def run_swarm(case: swarm.Case, rng: np.random.Generator) -> dict[str, float]:
         connected.append(states["paper"].parts == 1)
 
     run, ends = swarm.compare_filters(case, rng, filters, watch, every=10)
+    # Means over the last two seconds
     late = {k: swarm.average(v, case, FROM).mean() for k, v in run.items()}
     values = {
         "kde": late["kde"],
@@ -68,6 +69,7 @@ def run_swarm(case: swarm.Case, rng: np.random.Generator) -> dict[str, float]:
         "connected": float(np.mean(connected)),
     }
     values |= {s: late.get(f"{s}_error", np.nan) for s in RULES}
+    # Numbers sent by one agent in one step
     steps = case.agents * END / swarm.SWARM["dt"]
     for s in RULES[1:]:
         sent = ends[s].ledger.scalars.sum() / steps if s in ends else np.nan

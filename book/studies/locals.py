@@ -59,6 +59,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One run."""
     filters = {s: swarm.make_filter(s, CASE) for s in NAMES}
     run, _ = swarm.compare_filters(CASE, np.random.default_rng(seed), filters)
+    # Error curves by name: open loops, the observer, and each local filter
     lines = {n: run[n] for n in LINES[:3]} | {"central": run["central_error"][:, 0]}
     lines |= {
         f"{s}_{i}": run[f"{s}_error"][:, i]
@@ -73,6 +74,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         for n, e in lines.items()
         for t in MARKS
     }
+    # Means from 20 to 40 s of the observer and of flooding
     for s in NAMES[:1] + NAMES[2:]:
         values[f"{s}_20_40"] = swarm.average(run[f"{s}_error"], CASE, 20.0, 40.0).mean()
     for s in NAMES[1:]:
@@ -80,8 +82,10 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
             run[f"{s}_consensus"], CASE, late
         ).mean()
     local = run["paper_error"]
+    # The kernel estimate's mean error, below which a filter has to stay
     level = float(run["kde"].mean())
     k = round(5.0 / swarm.SWARM["dt"])
+    # The last five seconds over the first five
     falls = local[-k:].mean(axis=0) / local[:k].mean(axis=0)
     values |= {
         "central_half": swarm.average(lines["central"], CASE, half),

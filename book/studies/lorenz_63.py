@@ -37,6 +37,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     model = lorenz63(step=0.02)
     start = rng.standard_normal(3) + [1.5, -1.5, 25.5]
     times = DT * np.arange(1, 101 + STEPS)
+    # The first hundred times bring the state onto the attractor.
     path = simulate(model, start, times, rng=rng)
     first = path[99]
     truth = path[100:]
@@ -47,6 +48,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     for n, stream in zip(MEMBERS, draws, strict=True):
         state = stream.bit_generator.state
         for name, fit in MAPS.items():
+            # All maps of one size draw the same numbers.
             stream.bit_generator.state = state
             values.update(scores(f"{name}_{n}", fit, cloud[:n], truth, seen, stream))
     return values

@@ -43,6 +43,7 @@ TRIALS = 20
 
 def particle_update(x, h, y, r, *, rng, bandwidth):
     """Weigh, resample, jitter: a particle filter as an update of members."""
+    # Weights by the likelihood of the one observed component
     logs = -0.5 * ((y - h) ** 2).sum(axis=-1) / r[0, 0]
     w = np.exp(logs - logs.max())
     picked = x[resample(w / w.sum(), rng=rng)]
@@ -63,6 +64,7 @@ model = lorenz63(step=0.03)
 def draw_data(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A truth (T, 3), its observations (T, 1), and members of the prior (PARTICLES, 3)."""
     start = rng.standard_normal(3) + [1.5, -1.5, 25.5]
+    # The first hundred times bring the state onto the attractor.
     path = simulate(model, start, DT * np.arange(1, STEPS + 101), rng=rng)
     truth = path[100:]
     seen = truth[:, :1] + np.sqrt(VARIANCE) * rng.standard_normal((STEPS, 1))

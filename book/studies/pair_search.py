@@ -134,7 +134,7 @@ def log_ratios(y: np.ndarray, u: Cubes) -> np.ndarray:
     targets = []
     for fusion, places in zip(fusions(y), u[:2], strict=True):
         # The proposal mixes the three fused mixtures and the own belief.
-        parts = [*fuse_by_rules(fusion), fusion.own]
+        parts = [*fuse_by_rules(fusion), fusion.prior]
         x = map_to_points(mix(parts, SHARES), places)
         logs = np.array([m.log_density(x) for m in parts])
         base = np.logaddexp.reduce(logs + np.log(SHARES)[:, None])

@@ -77,7 +77,7 @@ def divergences(
         jeffreys_by_sampling(
             m.log_density,
             f.log_value,
-            arcs.mix(m, f.own, 0.8),
+            arcs.mix(m, f.prior, 0.8),
             members=MEMBERS,
             rng=np.random.default_rng(first + k),
         ).value
@@ -98,6 +98,7 @@ def reduce_shapes(
     fusions: list[PartialFusion], marginals: list[GaussianMixture], threshold: float
 ) -> dict[str, list[ComponentShapes]]:
     """Both agents' shapes by each rule, of the sizes that the relevance rule leaves."""
+    # The relevance rule sets the sizes; Runnalls' rule and pivoted QR get the same.
     relevant = [
         merge_irrelevant(marginals[k], marginals[1 - k], threshold=threshold)
         for k in (0, 1)

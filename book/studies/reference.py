@@ -127,6 +127,7 @@ def resample_poor(
     """Resample where the effective sample size is below one half."""
     w = normalize_logs(log)
     n = log.shape[-1]
+    # Effective sample size 1 / Σw² below n / 2
     poor = (w**2).sum(axis=-1) > 2 / n
     if poor.any():
         index = resample(w[poor].reshape(-1, n), rng=rng)
@@ -158,6 +159,7 @@ def update_angle(
     total = np.maximum(parts.sum(axis=-1), 1e-300)
     shift = (parts * steps).sum(axis=-1) / total
     variance_left = (parts * steps**2).sum(axis=-1) / total - shift**2
+    # The likelihood of the angle is the integral over y.
     log = log + np.log(total)
     # The other components follow y by regression.
     slope = p[..., 1] / variance[..., None]

@@ -65,6 +65,7 @@ def simulate_sightings(
     rng: np.random.Generator, radius: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw targets (steps, runs, 4), and ranges and bearings (steps, runs, A, 2)."""
+    # Relative positions without noise; the sensor adds its own.
     exact = replace(make_team(0), reading_cov=np.zeros((2, 2)))
     truth, gaps = exact.data(STEPS, RUNS, rng)
     eye = range_bearing([0, 1], std=SIGHT_STD)
@@ -77,6 +78,7 @@ def score_beliefs(
     """Return mean square error, NEES and runs lost of one way to cooperate."""
     gap = ((belief[0] - truth[:, :, None])[..., :2] ** 2).sum(axis=-1)
     score = team.nees(truth, belief)
+    # A target is lost if an agent's NEES is improbable near the end.
     lost = (score[-LATE:] > team.nees_quantile(RARE, 4)).any(axis=(0, 2))
     return {
         f"{name}_error": float(gap.mean()),

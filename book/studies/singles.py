@@ -69,6 +69,7 @@ def run_unscented(
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """Means over agents and the epochs from 2 to 20 h."""
     s = paper.SETTING
+    # The draws of the study `orbit`
     truth, *inputs = paper.simulate(s, np.random.default_rng(seed.spawn(1)[0]))
     beliefs = {"bound": paper.run_joint(s, paper.ONE, *inputs)}
     for row, fuses in ROWS.items():

@@ -60,12 +60,14 @@ def run_iterated(
     covs = []
     t0 = 0.0
     for t, y in zip(s.times, readings, strict=True):
+        # Forecast by the model's Jacobian
         slope = s.model.jacobian(means, t0, t - t0)
         cov = slope @ cov @ slope.mT + s.model.Q(t0, t - t0)
         means = x = s.model.step(means, t0, t - t0)
         t0 = t
         for _ in range(steps):
             h = sensor.jacobian(x)
+            # Innovation of the sensor linearized at x: y - h(x) - H (m - x)
             expected = np.einsum("...ij,...j->...i", h, means - x)
             gap = sensor.residual(y, sensor.predict(x)) - expected
             x, after = condition(means, cov, gap, h, sensor.noise_cov)

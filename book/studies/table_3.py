@@ -43,6 +43,7 @@ def run_central(truth: np.ndarray, seen: list[np.ndarray]) -> dict[str, float]:
     """The multiplicative filter of all sensors: twelve errors, three of them of the attitude."""
     chart = QuaternionChart(13, 9)
     (mean, cov) = SETUP.prior
+    # The prior mean's quaternion is scaled to length one.
     unit = np.concatenate([mean[:9], mean[9:] / np.linalg.norm(mean[9:])])
     result = mekf(
         unit,
@@ -54,6 +55,7 @@ def run_central(truth: np.ndarray, seen: list[np.ndarray]) -> dict[str, float]:
         times=SETUP.times,
     )
     error = ((result.means - truth) ** 2).sum(axis=-1)
+    # NEES in the twelve error components of the chart
     local = chart.local(result.means, truth)
     score = (local * np.linalg.solve(result.covariances, local[..., None])[..., 0]).sum(
         axis=-1

@@ -70,10 +70,12 @@ def consensus(
     if graph is None:
         return nu + dt * gains["alpha"] * (z - nu), eta
     pull = graph.laplacian.toarray()
+    # Substeps keep the explicit scheme stable for large gains.
     steps = stable_substeps(Channel(graph), dt, **gains)
     for _ in range(steps):
         difference = pull @ nu
         spring = pull @ eta
+        # ν' = α (z - ν) - a L ν + b L η and η' = -b L ν
         nu = nu + dt / steps * (
             gains["alpha"] * (z - nu) - gains["a"] * difference + gains["b"] * spring
         )
@@ -100,6 +102,7 @@ def errors(case: swarm.Case, rng: np.random.Generator) -> dict[str, np.ndarray]:
     x, p = swarm.draw_swarm(case, rng)
     waves = cells.cosines(swarm.MODES)
     gap = ((cells.centres - x[:, None]) ** 2).sum(axis=-1)
+    # Each agent's flat Gaussian about its own position
     flat = cells.normalize(np.exp(-0.5 * gap / swarm.FLAT**2))  # cut off at the walls
     # Consensus works on cosine coefficients of the kernels.
     wide = flat @ waves * cells.volume
@@ -127,15 +130,18 @@ def errors(case: swarm.Case, rng: np.random.Generator) -> dict[str, np.ndarray]:
             talk[s][0][who] @ waves.T if s in talk else np.tile(y, (len(who), 1))
             for s, who in ROWS.items()
         ]
+        # One Fokker-Planck step serves the truth and all filters.
         move = model.solver(j * dt, dt)
         p = move(p)
         state = density.low_rank_predict(state, move)
         # R = k max(p̂, floor)
         noise = k * np.maximum(state.estimates, CHOICES["floor"])
         state = density.low_rank_step(state, np.concatenate(estimates), noise, dt)
+        # Errors of all filters, split by scheme
         gaps = np.split(cells.norm(state.estimates - p), cuts[:-1])
         for s, gap in zip(ROWS, gaps, strict=True):
             collected[s].append(gap)
+        # The prior means alone: filters of zero gain
         collected["zero"].append(cells.norm(state.base[cuts[1] : cuts[2]] - p))
         collected["open"].append(cells.norm(state.base[:1] - p))
         collected["kde"].append(cells.norm(y - p))

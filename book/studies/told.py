@@ -48,6 +48,7 @@ def run_joint(
     state = f.start((first, paper.block_diagonal(covs)))
     beliefs = []
     for k, hour in enumerate(paper.HOURS):
+        # Only angles are observed: columns 0 and 1.
         state = f.step(state, 3600.0 * hour, list(seen[k, :, :2]))
         components = [[*range(6), *range(6 * a, 6 * a + 6)] for a in range(1, n + 1)]
         beliefs.append(

@@ -49,6 +49,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     x = rng.random((agents, 2))
     p = np.ones(cells.size)
     y = density.kernel_density(x, cells, bandwidth=h)
+    # The dense filter has the whole covariance, the others its leading columns.
     dense = density.Dense(y, full @ full.T)
     cut = {r: density.low_rank_start(full[:, :r], y[None]) for r in RANKS}
     k = density.kernel_constant(cells, bandwidth=h, agents=agents)
@@ -58,6 +59,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         x = swarm.step(x, j * DT, DT, rng=rng, substeps=CHOICES["substeps"])
         p = move(p)
         y = density.kernel_density(x, cells, bandwidth=h)
+        # All filters get the noise of the dense forecast.
         noise = k * np.maximum(move(dense.mean), CHOICES["floor"])
         dense = density.dense_step(dense, move, y, noise, DT)
         cut = {

@@ -47,6 +47,7 @@ def every_gain(
     ensembles: np.ndarray, channel: Any, *, include_self: bool
 ) -> np.ndarray:
     """Pull (G, A, N, d) ensembles, each of the G with its own gain: (16) is linear in γ."""
+    # (16) moves an ensemble in proportion to the gain.
     unit = 0.05
     moved = (
         mean_pull(ensembles, channel, gain=unit, include_self=include_self) - ensembles
@@ -65,9 +66,9 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         truth = np.broadcast_to(truth[:, None], shape)
         for name, (pca, include_self) in VERSIONS.items():
             f = satellites.paper_filter(s, pca=pca)
-            object.__setattr__(
-                f, "fusion", partial(every_gain, include_self=include_self)
-            )
+            # One gain for each of the runs, in place of the scenario's.
+            rule = partial(every_gain, include_self=include_self)
+            f = f.replace(fusion=rule)
             late = satellites.run_filter(s, f, for_filters, truth, seen).isel(
                 time=s.settled
             )

@@ -92,6 +92,7 @@ def curves(key: str, run: dict[str, np.ndarray]) -> dict[str, float]:
 
 def wrong_model(rng: np.random.Generator) -> dict[str, float]:
     """Local filters whose f is out of phase, with Q = 0 and with Q > 0."""
+    # Process noise in proportion to the leading modes of the prior
     scale = dict(zip(CHOICES["readings"], CHOICES["process_scale"], strict=True))[
         "gibbs"
     ]
@@ -127,6 +128,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     ):
         filters = {s: swarm.make_filter(s, case, 3) for s in names}
         run, ends = swarm.compare_filters(case, rng, filters, keep)
+        # Means from 10 s on
         late = {k: swarm.average(v, case, 10.0) for k, v in run.items()}
         metrics |= {f"{key}_{n}": late[n] for n in OPEN}
         if key == "table":

@@ -77,6 +77,7 @@ def missing_pages() -> list[str]:
 def is_chapter(source: Path) -> bool:
     """Return whether a Markdown page is a notebook: its header names a kernel."""
     text = source.read_text(encoding="utf-8")
+    # The header of a page stands between two lines of dashes.
     header = text.split("\n---", 1)[0] if text.startswith("---") else ""
     return "kernelspec:" in header
 
@@ -93,6 +94,7 @@ def chosen(names: list[str]) -> list[Path]:
         return chapters()
     paths = []
     for name in names:
+        # A name is that of a chapter, or its beginning up to a hyphen: "04" is 04-…, not 04b-….
         matches = [
             c for c in chapters() if c.stem == name or c.stem.startswith(f"{name}-")
         ]
@@ -111,6 +113,7 @@ def output_texts(output: Any) -> Iterator[str]:
     yield output.get("evalue", "")
     yield from output.get("traceback", [])
     for mime, value in output.get("data", {}).items():
+        # SVG is text, and may hold paths; frames inside HTML are pictures.
         if not mime.startswith("image/") or mime.endswith("svg+xml"):
             yield extract_pictures(value)[0] if isinstance(value, str) else repr(value)
 

@@ -53,6 +53,7 @@ def read(source: Path) -> Any:
     metadata = {
         k: v for k, v in header.items() if k in ("formats", "notebook_metadata_filter")
     }
+    # The format without the versions of jupytext, which would change with each update.
     layout = header.get("text_representation", {})
     metadata["text_representation"] = {
         k: v for k, v in layout.items() if k in ("extension", "format_name")
@@ -60,6 +61,7 @@ def read(source: Path) -> Any:
     notebook.metadata = nbformat.from_dict(
         {"jupytext": metadata, "kernelspec": KERNELSPEC, "language_info": LANGUAGE}
     )
+    # Numbered ids, so that executing again gives the same bytes.
     for k, cell in enumerate(notebook.cells):
         cell["id"] = f"{source.stem}-{k:03d}"
     notebook.nbformat = 4
@@ -124,6 +126,7 @@ def dump(notebook: Any) -> str:
         nbformat.writes(notebook, sort_keys=True, indent=1, ensure_ascii=False) + "\n"
     )
     state = notebook.metadata.get("widgets", {}).get(WIDGET_STATE, {}).get("state", {})
+    # Widgets have random ids: replace them by their numbers.
     for k, model in enumerate(state):
         text = text.replace(model, f"{k:032d}")
     # The keys were sorted by their random names: sort again by the new ones.
@@ -142,6 +145,7 @@ def unlike(stored: str, fresh: str, compare_bytes: bool) -> str:
     """Describe how another execution differs from the stored notebook; '' if it does not."""
     if stored == fresh:
         return ""
+    # Texts must be equal; pictures may differ in a few pixels.
     if compare_bytes or extract_pictures(stored)[0] != extract_pictures(fresh)[0]:
         return "another execution does not give the stored bytes"
     pairs = zip(cells_of(stored), cells_of(fresh), strict=True)
@@ -190,6 +194,7 @@ def copy_sources(source: Path) -> str:
     target = source.with_suffix(".ipynb")
     fresh = read(source)
     stored = nbformat.read(target, as_version=4)
+    # Outputs can be kept only if they belong to the same cells.
     if [c.cell_type for c in fresh.cells] != [c.cell_type for c in stored.cells]:
         return f"{target.name}: has other cells than the Markdown: make outputs"
     for new, old in zip(fresh.cells, stored.cells, strict=True):

@@ -48,7 +48,7 @@ HELP = """# API reference
 
 The reference is a page of the built book (`make book`). In a notebook `help(name)` or `name?` shows
 the same text: arguments with shapes and units, errors, and an example.
-`book/examples` has a filter of your own in thirty lines.
+`book/examples` has a filter of your own in sixty lines.
 """
 HIDDEN = {"hide-input", "remove-input", "remove-cell", "hide-cell"}
 
@@ -151,6 +151,7 @@ def render_role(
         )
     text, _, reference = target.rpartition("<")
     label = reference.rstrip(">").strip() if text else target
+    # A target may be a path of a page, or a label.
     label = label.removeprefix("/").removeprefix("book/").removesuffix(".md")
     words = text.strip() or all_names.words.get(label, label)
     home = all_names.homes.get(label, page)
@@ -174,6 +175,7 @@ def plain(text: str, page: str, all_names: Names, references: BibliographyData) 
     def dollars(match: re.Match[str]) -> str:
         return f"$${match['body']}\\tag{{{all_names.equations[match['label']]}}}$$"
 
+    # Equations first: their numbers come from labels that are removed here.
     text = MATH.sub(equation, DOLLARS.sub(dollars, text))
     text = SOLUTION.sub(lambda m: "**Solution**\n" if m[2] == "start" else "", text)
     text = INCLUDE.sub(lambda m: reproductions_text(), text)
@@ -189,6 +191,7 @@ def plain(text: str, page: str, all_names: Names, references: BibliographyData) 
 def notebook(source: Path, all_names: Names, references: BibliographyData) -> Any:
     """Return a chapter as a notebook that is not paired with a Markdown file."""
     stored = nbformat.read(source.with_suffix(".ipynb"), as_version=4)
+    # Without this, saving in JupyterLab would write the Markdown of the pair.
     stored.metadata.pop("jupytext", None)
     cells = []
     figures = 0
@@ -292,6 +295,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--no-open", action="store_true", help="make the copy only")
     options = parser.parse_args(arguments)
     folder = options.folder.resolve()
+    # The copy must not replace the repository, or lie within the book.
     if folder in (ROOT, *ROOT.parents) or folder.is_relative_to(BOOK):
         parser.error(f"{options.folder}: would be written over the repository")
     environment = settings(folder) if (folder / "book").is_dir() else {}

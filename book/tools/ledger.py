@@ -73,6 +73,7 @@ def ledger(
     ValueError
         If a verdict names no item, an item has two, or a verdict is not one of its kind's.
     """
+    # A verdict belongs to the item of the same paper and name.
     keys = [(item["paper"], item["item"]) for item in items]
     kinds = dict(zip(keys, (item["kind"] for item in items), strict=True))
     by_item: dict[tuple[str, str], dict[str, str]] = {}
@@ -91,6 +92,7 @@ def ledger(
                 f"{where}: verdict {verdict['verdict']!r}, needs one of {allowed}"
             )
         by_item[key] = verdict
+    # The item's cells, then those of its verdict, replace the blanks.
     blank = dict.fromkeys(COLUMNS, "") | {"verdict": OPEN}
     return [
         {name: (blank | item | by_item.get(key, {}))[name] for name in COLUMNS}
@@ -147,6 +149,7 @@ def split_claims(text: str, head: str) -> list[tuple[str, re.Match[str], str]]:
 
 def claims_of(row: dict[str, str]) -> list[LedgerClaim]:
     """Return the claims of a row of results, each with its null and its range."""
+    # Each cell of the row lists the claims by their ids, in its own form.
     ours = split_claims(row["ours"], r"(?P<id>[a-z0-9-]+) (?P<word>holds|fails): ")
     ids = "|".join(dict.fromkeys(match["id"] for _, match, _ in ours))
     nulls = {}

@@ -50,9 +50,11 @@ def as_webp(picture: Path) -> str | None:
     """Write a PNG again as lossless WebP if that is smaller; return its name without an ending."""
     target = picture.with_suffix(".webp")
     with Image.open(picture) as image:
+        # Keep the alpha channel only if some pixel is transparent.
         alpha = image.mode == "RGBA" and image.getextrema()[3][0] < 255
         plain = image.convert("RGBA" if alpha else "RGB")
     plain.save(target, lossless=True, quality=50, method=2)
+    # Keep the smaller one of the two files.
     larger, smaller = sorted((picture, target), key=lambda path: -path.stat().st_size)
     larger.unlink()
     return picture.stem if smaller == target else None
@@ -64,6 +66,7 @@ def outside(found: re.Match[str], images: Path, where: str) -> str:
     names = []
     for frame in data["frames"]:
         content = base64.b64decode(frame)
+        # Named by content: equal frames share a file.
         names += [f"{hashlib.sha256(content).hexdigest()[:24]}.webp"]
         (images / names[-1]).write_bytes(content)
     links = dict(

@@ -287,6 +287,7 @@ def number(text: str) -> float:
     fraction = re.fullmatch(pattern, text.lower())
     if fraction:
         return 1 / (number(fraction[1]) * LARGE[fraction[2]])
+    # "two hundred thousand and a half": parts are added, large words multiply.
     total = 0.0
     part = 0.0
     share = 1.0
@@ -317,6 +318,7 @@ def digits(text: str) -> int:
 def step_of(text: str, value: float) -> float:
     """Return one unit in the last digit; for words, a fifth of a fraction, else one."""
     if re.search(r"\d", text):
+        # 1.20e3 has two decimals, and its last digit is worth 10.
         mantissa, _, power = text.partition("e")
         return 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2]))
     return 1.0 if value == int(value) else 0.2 * abs(value)
@@ -385,6 +387,7 @@ def of_formula(match: re.Match[str]) -> str:
     formula = (
         match[1].replace("{,}", "").replace("\\,", " ").replace("\\%", "%").strip()
     )
+    # "2 + 3 = 5": the number at the end is checked here, if the rest is numbers only.
     parts = re.split(r"(=|\\approx)", formula)
     if len(parts) > 2 and re.fullmatch(r" ?-?\d+(?:\.\d+)? ?", parts[-1]):
         value = float(parts[-1])
@@ -394,6 +397,7 @@ def of_formula(match: re.Match[str]) -> str:
             loose, 0.5001 * step_of(parts[-1].strip(), value)
         ):
             return f" {parts[-1].strip()} ≗ "
+    # "2 · 10^3" is one number.
     power = re.fullmatch(r"(?:(.*)\\(?:cdot|times) ?)?10\^\{?(-?\d+)\}?", formula)
     if power and re.fullmatch(r"[\d.]*", power[1] or ""):
         return f" {float(power[1] or 1) * 10.0 ** int(power[2]):g} "
@@ -488,6 +492,7 @@ def one(
     ordinal = text.lower().removeprefix("a ") in ORDINAL and not re.match(
         r"of\b", after
     )
+    # An article, or "one" as a pronoun, is no numeral.
     if re.fullmatch(r"(?:an?|one)", text, re.I):
         return
     if after.startswith("≗"):
@@ -495,11 +500,13 @@ def one(
             chapter, line, section, text, value, 0.0, "", sentence, "arithmetic"
         )
         return
+    # "2 to 3 s": the unit of the second number is that of the first one too.
     interval = re.match(
         rf"(?:to|and|or|–) (?:{DIGITS.pattern}|{COUNT}) ?({'|'.join(UNITS)})", after
     )
     if interval and not unit:
         unit = next(u for u in UNITS if re.match(u, interval[1]))
+    # Small numbers without a unit need no source.
     kind = "small" if (tiny and not unit) or ordinal else ""
     if text.lower() in ("one", "two") and unit.startswith(("s", "m", "day")):
         kind = "small"
@@ -574,6 +581,7 @@ def checks(node: ast.Assert, section: int, where: str) -> Iterator[Fact]:
         if isinstance(part, ast.Compare):
             sides = [part.left, *part.comparators]
             ends = [constant(s) for s in sides]
+            # 0.1 < x < 0.3 encloses the numerals between both ends.
             if len(sides) == 3 and ends[0] is not None and ends[2] is not None:
                 low, high = sorted((ends[0], ends[2]))
                 yield Fact("check", low, high, where, section, words)
@@ -726,6 +734,7 @@ def output_facts(cell: Any, section: int, where: str) -> Iterator[Fact]:
     for output in cell.get("outputs", []):
         data = output.get("data", {})
         page = "".join(data.get("text/html", ""))
+        # The text of a picture is a digest, whose digits prove nothing.
         if SLIDER in page or any(mime.startswith("image/") for mime in data):
             continue
         verdict = [(str(v), "") for v in data.get(VERDICT, {}).values()]
@@ -1140,6 +1149,7 @@ def main() -> int:
                 n.source = n.kind
             else:
                 n.source = trace(n, find(n))
+                # How often would a wrong number have been traced as well?
                 if n.source and not n.source.startswith("beside"):
                     replacements = list(others(n))
                     n_replaced += len(replacements)

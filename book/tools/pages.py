@@ -103,6 +103,7 @@ def number_chapters(env: Any, number_of: Any) -> None:
         if number is None:
             continue
         entries = list(env.tocs[page].findall(nodes.reference))
+        # Sections have no number of their own.
         sections = dict.fromkeys([entry["anchorname"] for entry in entries])
         env.toc_secnumbers[page] = {**sections, "": (number,)}
         for node in (title, entries[0]):
@@ -249,6 +250,7 @@ def signature(kind: str, value: Any) -> tuple[str, str | None] | None:
     except (TypeError, ValueError):
         return None
     names: dict[str, Any] = {}
+    # Annotations are texts; a class inherits fields from modules of its bases.
     for owner in reversed(inspect.getmro(value) if kind == "class" else [value]):
         names |= vars(importlib.import_module(owner.__module__))
     texts = []
@@ -420,6 +422,7 @@ def link_code(
 
     if not names:
         return body
+    # Not after a dot (an attribute), and not before "=" (an argument's name)
     one = "|".join(map(re.escape, names))
     name = re.compile(
         rf'(?<!<span class="o">\.</span>)<span class="n">(?P<name>{one})</span>'
@@ -569,6 +572,7 @@ def needs() -> dict[int, set[int]]:
     needed: dict[int, set[int]] = {}
     for page in chapter_pages().values():
         text = " ".join((ROOT / f"{page}.md").read_text(encoding="utf-8").split())
+        # Links become their texts, so that "chapters 1, 2 and 3" can be read.
         text = re.sub(r"\[([^]]*)\]\(\d[^)]*\)", r"\1", text)
         sentence = re.search(r"You should know .*?\.(?= [A-Z`:|#]|$)", text)
         number = chapter_number(page) or 0
@@ -724,6 +728,7 @@ def gallery_text(folder: Path) -> str:
         lines += ["::::{grid} 2 2 3 4", ":gutter: 2", ""]
         for name, caption, alt, picture in figures(source):
             target = folder / f"{name}.png"
+            # Draw a small picture again only if the notebook is newer.
             modified = target.stat().st_mtime if target.is_file() else 0.0
             if modified < source.with_suffix(".ipynb").stat().st_mtime:
                 small = Image.open(io.BytesIO(picture)).convert("RGB")
@@ -757,6 +762,7 @@ def errata_text() -> str:
         text = (ROOT / "data" / "published" / paper / "README.md").read_text(
             encoding="utf-8"
         )
+        # The table of the section Errata, up to the next section
         table = text.split("## Errata", 1)[1].split("\n## ", 1)[0]
         rows = [line for line in table.splitlines() if line.startswith("|")]
         lines += [f"### {title} (`{paper}`)", "", *map(with_links, rows), ""]

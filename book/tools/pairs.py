@@ -44,6 +44,7 @@ def differences(source: Path, stored: Any) -> list[str]:
             f"{len(fresh.cells)} cells in the Markdown, {len(stored.cells)} stored"
         )
     for ours, theirs in zip(fresh.cells, stored.cells, strict=False):
+        # Outputs and execution counts are the notebook's own.
         for key in ("id", "cell_type", "source", "metadata"):
             if ours.get(key) != theirs.get(key):
                 problems.append(
@@ -112,6 +113,7 @@ def figure_faults(cell: Any) -> list[str]:
             faults.append(
                 "a picture without the digest of its axes: plotting.use_style()"
             )
+    # A slider has its alternative text in its HTML.
     moving = [data for data in pictures if SLIDER in data.get("text/html", "")]
     if not moving and not str(options.get("image", {}).get("alt", "")).strip():
         faults.append("a figure without mystnb.image.alt in its header")
@@ -143,6 +145,7 @@ def strays() -> list[str]:
             problems.append(f"{path.name} is not in _toc.yml")
         if path.suffix == ".ipynb" and not path.with_suffix(".md").is_file():
             problems.append(f"{path.name} has no Markdown source")
+        # Code on a page that is no notebook would never run.
         if path.suffix == ".md" and not is_chapter(path):
             text = path.read_text(encoding="utf-8")
             if re.search(r"^(`{3,}|:{3,})\{code-cell\}", text, flags=re.MULTILINE):

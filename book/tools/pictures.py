@@ -70,6 +70,7 @@ def shrink_picture(picture: str) -> str:
     image = Image.open(io.BytesIO(base64.b64decode(picture)))
     if image.mode == "P" or (image.mode == "RGBA" and image.getextrema()[3][0] < 255):
         return picture
+    # Without dithering, so that areas of one colour stay one colour.
     palette = image.convert("RGB").quantize(256, kmeans=1, dither=Image.Dither.NONE)
     if _share_of_differences(image, palette, TINT) > TINTED:
         return picture
@@ -87,6 +88,7 @@ def shrink_pictures(outputs: list[Any]) -> None:
 
 def _share_of_differences(one: Image.Image, other: Image.Image, by: float) -> float:
     """Return the fraction of pixels with a colour that differs by more than `by` of 255."""
+    # The largest difference of the three colours, for each pixel
     bands = ImageChops.difference(one.convert("RGB"), other.convert("RGB")).split()
     counts = reduce(ImageChops.lighter, bands).histogram()
     return sum(counts[int(by) + 1 :]) / sum(counts)
@@ -101,6 +103,7 @@ def difference(one: str, other: str) -> str:
         share = _share_of_differences(a, b, 255 * SHADE) if a.size == b.size else 1.0
     except (OSError, ValueError, binascii.Error):
         return "is no picture"
+    # Pictures of other sizes cannot be compared by pixels.
     if a.size != b.size:
         return f"has {a.width} x {a.height} pixels, not {b.width} x {b.height}"
     return f"differs in {share:.2%} of its pixels" if share > SHARE else ""

@@ -88,6 +88,7 @@ def scripts(root: Path) -> list[ModuleType]:
     """Return the scripts of a repository, in order; two for one file are an error."""
     paths = sorted((root / "book" / "studies").glob("*.py"))
     all_scripts = [load_script(path) for path in paths if not path.name.startswith("_")]
+    # Two scripts must not write the same file.
     targets = [target(script, root) for script in all_scripts]
     twice = sorted({t.name for t in targets if targets.count(t) > 1})
     if twice:
@@ -130,6 +131,7 @@ def check(script: ModuleType, root: Path, workers: int | None) -> str:
     file = path.relative_to(root)
     if not path.is_file():
         return f"{file}: not stored yet: make studies"
+    # Tolerances are optional names of a script.
     options = {name: getattr(script, name) for name in ALLOWED if hasattr(script, name)}
     try:
         stored = studies.check(path, script.trial, workers=workers, **options)
@@ -137,6 +139,7 @@ def check(script: ModuleType, root: Path, workers: int | None) -> str:
         return str(error)
     if tuple(map(seed_text, script.seeds)) != stored.seeds:
         return f"{file}: the script has other seeds: make studies"
+    # Compare as JSON, in which arrays are lists and tuples too.
     written = {
         name: json.loads(text)
         for name, text in plain_json(parameters_of(script)).items()

@@ -117,8 +117,10 @@ def article(page: str, pages: list[str]) -> tuple[Tag, list[Tag]]:
     assert text is not None, page
     for part in text.select(GONE):
         part.decompose()
+    # Folded parts are open in print.
     for part in text.select("details"):
         part.unwrap()
+    # Ids of all pages are in one document: make them unique by the page's name.
     for node in text.find_all(id=True):
         node["id"] = key(page, str(node["id"]))
     for link in text.find_all("a", href=True):
@@ -126,6 +128,7 @@ def article(page: str, pages: list[str]) -> tuple[Tag, list[Tag]]:
     for picture in text.find_all("img"):
         picture["src"] = (path.parent / unquote(str(picture["src"]))).resolve().as_uri()
         del picture["loading"]
+    # A long table may be split between pages.
     for table in text.find_all("table"):
         if len(table.find_all("tr")) > 14:
             table["class"] = [*table.get("class", []), "long"]
@@ -179,6 +182,7 @@ def assemble() -> tuple[str, list[str]]:
     html_text = "".join(
         (BUILT / f"{page}.html").read_text(encoding="utf-8") for page in pages
     )
+    # The settings of the pages hold for the whole book.
     config = re.search(r"<script>(window\.MathJax = .*?)</script>", html_text)
     assert config is not None, "pages have no mathematics"
     mathjax = (BUILT / "_static" / "mathjax" / "tex-mml-chtml.js").as_uri()
@@ -229,10 +233,12 @@ def pages_of(pdf: bytes) -> dict[str, int]:
         kids = re.findall(rb"(\d+) 0 R", below[1]) if below else []
         return [leaf for kid in kids for leaf in leaves(kid)] if below else [number]
 
+    # The catalog leads to the tree of pages, whose leaves are the pages in order.
     root = next(n for n, text in objects.items() if b"/Type /Catalog" in text)
     top = re.search(rb"/Pages (\d+) 0 R", objects[root])
     assert top is not None, "a PDF without pages"
     order = {number: k + 1 for k, number in enumerate(leaves(top[1]))}
+    # Named destinations: /name [page 0 R /XYZ ...]
     places = re.findall(
         rb"/([^\s/\[\]<>()]+)\s*\[(\d+) 0 R\s*/XYZ", b"\n".join(objects.values())
     )
@@ -278,6 +284,7 @@ def open_page(driver: Any, page: Path) -> None:
 def pdf(driver: Any, parts: list[str]) -> bytes:
     """Return the book as a PDF, printed twice: the first gives the page numbers of the contents."""
     places = pages_of(print_page(driver))
+    # Every part must begin on a page of its own, in order.
     starts = [places[part] for part in parts if part in places]
     if len(starts) != len(parts) or starts != sorted(set(starts)):
         sys.exit(

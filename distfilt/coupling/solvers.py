@@ -40,6 +40,10 @@ _PIVOTS = 10_000_000
 """Largest number of pivots of the network simplex; more mean that it cycles."""
 _NEWTON = 1000
 """Largest number of Newton steps; twenty are enough as a rule."""
+_OPTIMAL = 1e-9
+"""A plan is solved again if its duality gap is a larger part of its cost."""
+_FORBIDDEN = 1e6
+"""Costs that exceed all others by this factor are those of forbidden links."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +131,9 @@ def transport_plan(
     ----------
     cost : array_like, (N, M)
         Cost of a unit of mass from each row to each column. It is shifted and divided by its range
-        before the solution, since the solvers' tolerances are absolute.
+        before the solution, since the solvers' tolerances are absolute. The range is that of the
+        links that can carry mass: rows and columns without mass do not count, and a very large
+        cost forbids a link without an effect on the others.
     rows : array_like, (N,)
         Nonnegative masses that sum to one.
     columns : array_like, (M,), optional
@@ -137,7 +143,8 @@ def transport_plan(
         other adds the plan's entropy to the cost.
     regularisation : float
         For ``"entropic"``: the weight of the entropy in units of the cost's range. Its plan is
-        spread out and costs more than the optimal one.
+        spread out and costs more than the optimal one. Costs a million times larger than all
+        others do not count in the range, unless the plan needs these links.
 
     Returns
     -------
@@ -150,7 +157,8 @@ def transport_plan(
     ValueError
         If sizes differ, a mass is negative, a sum is not one or a cost is not finite.
     SolverError
-        With the solver's status, if it stops without a solution.
+        With the solver's status, if it stops without a solution, or if the duality gap of the
+        network simplex shows that its plan is not optimal.
     ModuleNotFoundError
         If the solver's package is not installed; the message names the extra that brings it.
 
@@ -169,13 +177,14 @@ def transport_plan(
     >>> float(round(plan.value, 9)), plan.duality_gap < 1e-12
     (1.5, True)
     """
-    row_masses, column_masses = _normalize_masses(rows, columns, cost.shape[1])
-    scaled_cost, minimum, scale = scale_cost(cost)
+    a, b = _normalize_masses(rows, columns, cost.shape[1])
     solve = solver_of(solver, regularisation)
-    matrix, potential = solve(scaled_cost, row_masses, column_masses)
-    return _certify(
-        cost, row_masses, column_masses, matrix, minimum + scale * potential
-    )
+    if solver == "entropic":
+        matrix, potential = _solve_allowed(cost, a, b, solve)
+        return _certify(cost, a, b, matrix, potential)
+    matrix, potential = _solve_massive(cost, a, b, solve)
+    plan = _certify(cost, a, b, matrix, potential)
+    return _improve(plan, cost, a, b, solve)
 
 
 def _normalize_masses(
@@ -189,13 +198,121 @@ def _normalize_masses(
     return rows / rows.sum(), column_masses
 
 
-def scale_cost(cost: Array) -> tuple[Array, float, float]:
-    """Return the cost between zero and one, its minimum and its range."""
+def scale_cost(
+    cost: Array, limit: float | None = None
+) -> tuple[Array, float, float]:
+    """Return the cost between zero and one, its minimum and its range.
+
+    With a limit the range is up to there, and larger costs remain larger than one.
+    """
     minimum = float(cost.min())
-    scale = float(cost.max()) - minimum
+    largest = float(cost.max()) if limit is None else limit
+    scale = largest - minimum
     # A constant cost has no range, and any coupling is optimal.
     divisor = scale if scale > 0 else 1.0
     return (cost - minimum) / divisor, minimum, scale
+
+
+def _massive_cost(cost: Array, a: Array, b: Array) -> Array:
+    """Return the costs between rows and columns that have mass."""
+    return np.asarray(cost[np.ix_(np.flatnonzero(a), np.flatnonzero(b))])
+
+
+def _solve_massive(
+    cost: Array, a: Array, b: Array, solve: Solve, limit: float | None = None
+) -> tuple[Array, Array]:
+    """Solve for rows and columns with mass, for costs in units of their range up to a limit.
+
+    Returns the plan and the columns' potentials, zero for those without mass.
+    """
+    rows = np.flatnonzero(a)
+    columns = np.flatnonzero(b)
+    massive = _massive_cost(cost, a, b)
+    scaled_cost, minimum, scale = scale_cost(massive, limit)
+    part, g = solve(scaled_cost, a[rows], b[columns])
+    matrix = np.zeros(cost.shape)
+    matrix[np.ix_(rows, columns)] = part
+    potential = np.zeros(cost.shape[1])
+    potential[columns] = minimum + scale * g
+    return matrix, potential
+
+
+def _solve_allowed(
+    cost: Array, a: Array, b: Array, solve: Solve
+) -> tuple[Array, Array]:
+    """Solve the entropic problem with the range of the links that are not forbidden."""
+    massive = _massive_cost(cost, a, b)
+    limit = _largest_allowed(massive)
+    if limit is not None:
+        try:
+            matrix, potential = _solve_massive(cost, a, b, solve, limit)
+        except SolverError:
+            limit = None
+        else:
+            if not matrix[cost > limit].any():
+                return matrix, potential
+    # All links count if there are no forbidden ones, or if the plan cannot do without.
+    return _solve_massive(cost, a, b, solve)
+
+
+def _largest_allowed(cost: Array) -> float | None:
+    """Return the largest cost below a wide gap that forbidden links leave, if there is one.
+
+    >>> _largest_allowed(np.array([[0.0, 1.0], [3.0, 1e9]]))
+    3.0
+    >>> _largest_allowed(np.array([[0.0, 1.0], [3.0, 9.0]]))
+    """
+    shifted = cost - cost.min()
+    # Every row and every column needs its cheapest link at least.
+    needed = max(shifted.min(axis=1).max(), shifted.min(axis=0).max())
+    values = np.sort(shifted[(shifted > 0) & (shifted >= needed)])
+    gaps = np.flatnonzero(values[1:] > _FORBIDDEN * values[:-1])
+    if not gaps.size:
+        return None
+    return float(values[gaps[0]] + cost.min())
+
+
+def _improve(
+    plan: TransportPlan, cost: Array, a: Array, b: Array, solve: Solve
+) -> TransportPlan:
+    """Solve again with costs cut at a limit while the duality gap is too wide.
+
+    Beside a very large cost the others vanish in the solver's rounding. A plan for cut costs that
+    uses no link above the limit is a plan for all.
+    """
+    massive = _massive_cost(cost, a, b)
+    minimum = float(massive.min())
+    limit = minimum + 1e6 * (plan.value - minimum)
+    for _ in range(20):
+        excess = plan.value - minimum
+        is_optimal = plan.duality_gap <= _OPTIMAL * excess
+        if is_optimal or limit >= massive.max():
+            break
+        matrix, potential = _solve_massive(np.minimum(cost, limit), a, b, solve)
+        if matrix[cost > limit].any():
+            # The plan needs dearer links.
+            limit = minimum + 1e3 * (limit - minimum)
+            continue
+        trial = _certify(cost, a, b, matrix, potential)
+        if not trial.duality_gap < plan.duality_gap:
+            break
+        plan = trial
+        limit = minimum + 1e6 * (plan.value - minimum)
+    _check_gap(plan, minimum, a, b)
+    return plan
+
+
+def _check_gap(plan: TransportPlan, minimum: float, a: Array, b: Array) -> None:
+    """Raise an error if the duality gap is more than rounding can make it."""
+    f, g = plan.potentials
+    # Rounding of the two sums of the bound, and of the cost.
+    sizes = np.abs(f) @ a + np.abs(g) @ b + abs(plan.value)
+    allowed = 1e-6 * (plan.value - minimum) + 1e-12 * float(sizes)
+    if not plan.duality_gap <= allowed:
+        raise SolverError(
+            f"network simplex: the plan's cost {plan.value:.6g} is not optimal, its bound "
+            f"is {plan.bound:.6g}: cost must have entries less far apart"
+        )
 
 
 def _certify(cost: Array, a: Array, b: Array, matrix: Array, g: Array) -> TransportPlan:

@@ -53,6 +53,10 @@ Forecast = Annotated[ArrayInput, "*transformed.shape", SQUARED]
 _TIE_BREAK = 1e-7
 """Largest addition to a cost, in units of its range. The weighted mean stays exact, the plan costs
 at most this more."""
+_FAR = 1e-3
+"""Members are far from each other if a quarter of the costs is below this part of the range."""
+_NO_MASS = 1e-15
+"""Weights below this are spread evenly where there are far members."""
 
 
 def normalize_weights(
@@ -114,7 +118,8 @@ def transport_plans(ensemble: SquarableEnsemble, log_weights: ArrayLike) -> Arra
     ndarray, (..., N, N)
         Row i is the distribution of member i's mass; the cost is the squared distance. If several
         plans are optimal, as with copies of a member, a fixed addition of at most 1e-7 of the
-        largest cost makes the choice.
+        largest cost makes the choice. Where members are far from most others it is at most 1e-7
+        of each cost and of the typical one.
 
     Examples
     --------
@@ -141,9 +146,49 @@ def _solve_couplings(costs: Array, weights: Array, solve: Solve) -> Array:
     addition = _tie_breaker(n)
     plans = np.empty_like(costs)
     for index in np.ndindex(weights.shape[:-1]):
-        cost = scale_cost(costs[index])[0] + addition
-        plans[index], _ = solve(cost, weights[index], equal)
+        scaled_cost = scale_cost(costs[index])[0]
+        if _has_far_members(scaled_cost):
+            plans[index] = _couple_far_members(costs[index], weights[index], solve)
+            continue
+        plans[index], _ = solve(scaled_cost + addition, weights[index], equal)
     return plans
+
+
+def _has_far_members(scaled_cost: Array) -> bool:
+    """Whether a few large costs set the range, so that most are small beside it.
+
+    >>> x = np.array([[0.0], [1.0], [2.0], [3.0], [1e4]])
+    >>> for members in (x, x[:4]):
+    ...     _has_far_members(scale_cost(squared_distances(members))[0])
+    True
+    False
+    """
+    # Copies of a member are at no distance, but for rounding.
+    is_apart = scaled_cost > 1e-28
+    is_near = is_apart & (scaled_cost < _FAR)
+    return bool(4 * np.count_nonzero(is_near) > np.count_nonzero(is_apart))
+
+
+def _couple_far_members(costs: Array, weights: Array, solve: Solve) -> Array:
+    """Return the coupling of the weights to equal masses where some members are far away.
+
+    Costs are in units of what has to be moved, and ties are broken by a part of each cost, which
+    is not above the distances of near members.
+    """
+    n = weights.size
+    equal = np.full(n, 1 / n)
+    rows = np.flatnonzero(weights > _NO_MASS)
+    # A constant in a column does not change the plan: far members differ in the rest only.
+    needed = costs[rows] - costs[rows].min(axis=0)
+    is_apart = needed > 1e-28 * needed.max()
+    typical = np.median(needed[is_apart]) if is_apart.any() else 0.0
+    needed = needed + _tie_breaker(n)[rows] * (needed + typical)
+    mass = weights[rows].sum()
+    part, _ = solve(scale_cost(needed)[0], weights[rows] / mass, equal)
+    # What hardly has any weight goes everywhere alike, so that the masses stay exact.
+    plan = np.outer(weights, equal)
+    plan[rows] = mass * part
+    return plan
 
 
 @validated

@@ -91,12 +91,14 @@ class Filter(FrozenModel, ABC, Generic[S]):
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         # A new summary may be written for single states only.
+        # Such a subclass says itself if its summary accepts several states.
         if "summarize" in vars(cls) and "batched_summary" not in vars(cls):
             cls.batched_summary = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_parts()
+        # Delays belong to the observations, which have times of their own.
         if self.faults is not None and self.faults.total_delay:
             raise ValueError(
                 f"faults must be Faults without a delay, got {self.faults!r}"
@@ -106,6 +108,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
             raise ValueError(
                 f"names must have {n} different names, got {list(self.names)}"
             )
+        # A rule of the library says which kind of belief it fuses; others are not asked.
         kind = None if self.fusion is None else kind_of_rule(self.fusion)
         if kind is not None and kind != self.belief_kind:
             raise ValueError(
@@ -237,6 +240,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         if runs and min(runs) < 1:
             raise ValueError(f"runs must be sizes of at least 1, got {runs!r}")
         fields = self.initial_state(prior, runs, rng)
+        # The steps have a stream of their own, whatever else the user draws from `rng`.
         child = None
         if self.requires_rng and rng is not None:
             (child,) = rng.spawn(1)
@@ -290,13 +294,16 @@ class Filter(FrozenModel, ABC, Generic[S]):
         reuse_rng: bool = False,
     ) -> S:
         """Take one step from checked arguments."""
+        # A state of agents with sensors knows its runs from their failures.
         runs = state.failed.shape if isinstance(state, SensorState) else state.runs
         read = self.read_observations(observations, runs, t)
         matched = match_delayed(cast(Any, self), delayed, state, t) if delayed else ()
+        # From here on all inputs are checked, and the family's own method does the rest.
         step = Step(self, state, t, read, matched, reuse_rng=reuse_rng)
         try:
             return self.next_state(step)
         except RECOVERABLE as error:
+            # A wrong argument is the caller's error; anything else is a failure of the step.
             if is_argument_error(error):
                 raise
             raise FilterError((), None, t, error) from error
@@ -335,6 +342,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         reuse_rng: bool,
     ) -> Iterator[S]:
         """Yield the states of a run, each delayed observation at the time when it has arrived."""
+        # An observation that arrives after the last step would be lost without a word.
         last = grid[-1] if grid.size else -np.inf
         for observation in delayed:
             arrival = observation.arrival_time
@@ -342,6 +350,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
                 raise ValueError(
                     f"delayed must have an arrival_time up to {last:g}, got {arrival}"
                 )
+        # In order of arrival; those with the same arrival keep the user's order.
         waiting = sorted(delayed, key=_arrival_time)
         is_own = False
         for t, observed in zip(grid.tolist(), entries, strict=True):
@@ -404,6 +413,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
 
     def final_state(self, run: xarray.Dataset) -> S:
         """Return the state in which a run of this filter ended."""
+        # The run may be another filter's, which the check finds.
         state = cast(S, final_state(run))
         self.check_state(state)
         return state
@@ -422,6 +432,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         self.check_state(state)
         grid, entries = plan_steps(self, state, times, observations)
         states = self._iterate(state, grid, entries, delayed, reuse_rng=True)
+        # Without a lag every state is its own smoothed one.
         smoothed = _smooth_states(states, lag)
         return record_run(self, grid, state, smoothed, truth, scores)
 
@@ -492,6 +503,7 @@ class SensorFilter(Filter[S]):
                     f"graph must be a Graph of {self.n_agents} agents, got None"
                 )
         elif not callable(self.graph):
+            # A fixed graph is converted once.
             graph = as_graph(self.graph, self.n_agents, self.names)
             object.__setattr__(self, "graph", graph)
         has_interval = self.exchange_interval is not None
@@ -508,6 +520,7 @@ class SensorFilter(Filter[S]):
     @cached_property
     def agent_sensors(self) -> tuple[tuple[Sensor, ...], ...]:
         """Each agent's sensors."""
+        # None, one sensor, or several: always a tuple.
         result: list[tuple[Sensor, ...]] = []
         for sensors in self.sensors:
             if sensors is None:
@@ -532,6 +545,7 @@ class SensorFilter(Filter[S]):
     def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Names and units of the state's components; numbers if the model has no names."""
         model = self.model
+        # A model without names or units has numbers and blanks.
         names = tuple(model.names) or tuple(str(k) for k in range(model.dim))
         return names, tuple(model.units) or ("",) * model.dim
 
@@ -542,8 +556,10 @@ class SensorFilter(Filter[S]):
             return None
         if not self.is_exchange_time(state.t, t):
             return None
+        # A moving graph is asked for its links at this time.
         if not isinstance(graph, Graph):
             graph = as_graph(graph(t), self.n_agents, self.names)
+        # Without a link nothing can be sent, and no round is counted.
         if not graph.senders.size:
             return None
         runs = state.failed.shape if isinstance(state, SensorState) else state.runs

@@ -214,6 +214,7 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
         self, observations: Any, runs: tuple[int, ...], t: float
     ) -> SwarmSnapshot:
         """Check the agents' positions (A, d); None and NaN are agents that have gone."""
+        # An agent that has gone has no position.
         missing = np.full(self.model.grid.dim, np.nan)
         entries = list_by_agent(observations, self.n_agents)
         positions: Any = [missing if entry is None else entry for entry in entries]
@@ -270,6 +271,7 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
         if isinstance(self.graph, float):
             return snapshot.disk_graph(self.graph)
         graph = self.graph
+        # A moving graph may depend on where the agents are.
         if not isinstance(graph, Graph):
             graph = call_user(graph, t, snapshot.positions)
         return remove_absent(as_graph(graph, self.n_agents), snapshot.present)
@@ -302,8 +304,10 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
         memory, densities, counts = self.fusion.update(
             state.carried, snapshot, channel, dt
         )
+        # The protocol runs at all agents, the filter at some of them.
         observed = densities[self.filtering]
 
+        # The forecast is one step of the Fokker-Planck equation.
         solver = self.model.solver(state.t, dt)
         noise_factor = None
         if self.process is not None:
@@ -313,6 +317,7 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
         density = forecast.estimates if self.noise == "forecast" else observed
         noise = snapshot.noise_strength(density, snapshot.present.sum(), self.floor)
         filters = low_rank_step(forecast, observed, noise, dt)
+        # Connected components of the agents that are present.
         parts = np.unique(graph.components[snapshot.present]).size
         return step.end(
             positions=snapshot.positions,
@@ -332,6 +337,7 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
         shape = (self.n_agents, self.model.grid.size)
         mean = np.full(shape, np.nan)
         variance = np.full(shape, np.nan)
+        # Agents without a filter are NaN in the record.
         mean[self.filtering] = state.estimates
         variance[self.filtering] = state.variances
         numbers = {

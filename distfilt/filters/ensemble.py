@@ -232,6 +232,7 @@ class EnsembleFilter(
         >>> bool(abs(state.ensembles.var(ddof=1) - p / (p + 1.0)) < 1e-12)
         True
         """
+        # The user's options come last and win.
         exact: dict[str, Any] = {"update": enkf_exact, "forecast": exact_forecast}
         if graph is not None:
             exact["fusion"] = partial(intersect_ensembles, rule="min_determinant")
@@ -258,6 +259,7 @@ class EnsembleFilter(
         state = step.state
         ensembles = state.ensembles
         if step.dt:
+            # Every member moves with the model and meets a draw of its noise.
             ensembles = call_user(
                 self.forecast, ensembles, self.model, state.t, step.dt, rng=step.rng
             )
@@ -266,6 +268,7 @@ class EnsembleFilter(
         stack = step.stack(step.check_forecast(ensembles, state.ensembles))
         for place, group in step.received():
             self._condition(stack, place, group, step)
+        # Agents exchange beliefs after the update, through the same channel.
         (fused,) = step.fuse(stack[-1])
         return step.end(ensembles=fused, past=regress_past(stack, fused))
 
@@ -286,11 +289,11 @@ class EnsembleFilter(
 
         def compute(h: Array, y: Array, *args: Any) -> tuple[Array, ...]:
             *past, present, noise, rng = args
-            again = predict if h.shape == predicted.shape else None
+            predict_again = predict if h.shape == predicted.shape else None
             # All times' members meet the same draws, so that the separate updates are one joint
             # update; the last of them advances the generator.
             updated = [self._update(x, h, y, noise, copy_rng(rng), None) for x in past]
-            return (*updated, self._update(present, h, y, noise, rng, again))
+            return (*updated, self._update(present, h, y, noise, rng, predict_again))
 
         results = step.apply(
             compute,
@@ -300,6 +303,7 @@ class EnsembleFilter(
             shared=group.noise,
             rng=step.rng,
         )
+        # Other agents' members are not touched.
         for ensembles, new in zip(stack, results, strict=True):
             ensembles[..., rows, :, :] = new
 
@@ -396,6 +400,7 @@ class TransportFilter(_EnsembleSummary):
         self, prior: Prior, runs: tuple[int, ...], rng: Any
     ) -> dict[str, Any]:
         """Draw one set of members, (N, d) or (*runs, 1, N, d), for all agents."""
+        # One draw, repeated for every agent.
         common = self.draw_prior(prior, (*runs, 1), rng)
         return {"ensembles": np.repeat(common, self.n_agents, axis=-3)}
 
@@ -446,6 +451,7 @@ class TransportFilter(_EnsembleSummary):
             previous = step.before(place, group, stack[:-1])
             predicted = group.predict(stack[place][..., rows, :, :], previous)
             group = step.gate(group, sample_moments, predicted)
+            # Σ log p(y | xᵢ) over the observations that the agent has.
             logs[..., rows, :] += log_likelihood(predicted, group.target, group.noise)
             warn_of_weights(0 * predicted[..., 0], predicted, group.target, group.noise)
         return logs
@@ -457,6 +463,7 @@ class TransportFilter(_EnsembleSummary):
 
         def compute(logs: Array, *args: Any) -> tuple[Array, ...]:
             *times, _, _ = args
+            # The plan is optimal for the present members and moves their past along.
             weights = normalize_weights(logs)
             plan = transport_plans(times[-1], logs)
             return tuple(

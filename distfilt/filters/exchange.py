@@ -31,6 +31,7 @@ def collect_observations(step: Step[Any]) -> Known:
     An agent has its own observations and those that its neighbours sent, ordered by sender.
     """
     observed = [list(of_agent) for of_agent in step.observations]
+    # Delayed observations carry their own time, and are sorted with the others below.
     for observation in step.delayed:
         observed[observation.agent].append(observation)
     sent = _choose_outgoing(step, observed)
@@ -43,8 +44,9 @@ def collect_observations(step: Step[Any]) -> Known:
     sent_labels = own_labels
     if step.state.pending:
         sent_labels = [_label(step, of_agent) for of_agent in sent]
-    known: Known = {}
+    by_time: Known = {}
     for agent, messages in enumerate(inbox):
+        # In order of the senders, so that all agents with the same set have the same order.
         for sender in sorted((agent, *messages)):
             if sender == agent:
                 times_and_sensors = own_labels[agent]
@@ -55,10 +57,10 @@ def collect_observations(step: Step[Any]) -> Known:
                 values = list(payload) if type(payload) is tuple else [payload]
             # The part behind the values counts as communication alone.
             for (t, sensor), value in zip(times_and_sensors, values, strict=False):
-                if t not in known:
-                    known[t] = [[] for _ in observed]
-                known[t][agent].append((sensor, value))
-    return known
+                if t not in by_time:
+                    by_time[t] = [[] for _ in observed]
+                by_time[t][agent].append((sensor, value))
+    return by_time
 
 
 def _choose_outgoing(
@@ -82,6 +84,7 @@ def _choose_outgoing(
             ]
             step.pending = (*waiting, *new)
         return []
+    # First the pending observations, which the receivers assimilate at their stored times.
     outgoing: list[list[Observation]] = [[] for _ in observed]
     for observation in waiting:
         if observation.t not in step.times:
@@ -103,10 +106,13 @@ def _pack(step: Step[Any], observations: list[Observation]) -> Any:
         return None
     numbers: list[float] = []
     for observation in observations:
+        # A sensor of the observation's own has no number; its metadata describe it.
         number = observation.sensor if isinstance(observation.sensor, int) else -1
         numbers += [observation.t, number, *observation.metadata]
+    # Time and sensor go without saying: now, and the first one.
     if len(observations) == 1 and numbers in ([step.t, 0], [step.t, -1]):
         return observations[0].value
+    # The same labels in all runs.
     labels = np.broadcast_to(np.array(numbers), (*step.runs, len(numbers)))
     return (*[observation.value for observation in observations], labels)
 
@@ -147,6 +153,7 @@ def fuse_beliefs(step: Step[Any], values: tuple[Array, ...]) -> tuple[Array, ...
         used.append(attempt)
         return results
 
+    # All runs at once, and one by one if that fails.
     results = step.apply(fuse_runs, (*inputs, run_numbers), values)
     if used:
         step.channel = _merge_channels(channel, used, run_numbers)

@@ -104,6 +104,7 @@ def recompute_rows(
     errors : dict
         The reason for each failure, by the row's index.
     """
+    # A row is one run, or one run of one agent.
     rows = list(np.ndindex(arrays[0].shape[:lead]))
     results = tuple([values.copy() for values in fallback])
     errors: dict[Row, str] = {}

@@ -75,6 +75,7 @@ class GaussianState(SensorState):
         states = []
         n = len(self.history)
         for k, t in zip(range(n, 0, -1), self.times, strict=True):
+            # The present state is the first block, the latest earlier one the second.
             block = slice(k * self.dim, (k + 1) * self.dim)
             mean = self.joint_means[..., block]
             cov = self.joint_covariances[..., block, block]
@@ -151,6 +152,7 @@ class GaussianFilter(
     def check_state(self, state: GaussianState) -> None:
         """Refuse a state that is not of this filter."""
         super().check_state(state)
+        # The joint state may be longer, by the past.
         if state.dim != self.model.dim:
             raise ValueError(
                 f"state must have sizes {(self.model.dim,)} an agent, got {(state.dim,)}"
@@ -166,6 +168,7 @@ class GaussianFilter(
         definiteness = "semidefinite" if is_extended else "definite"
         mean, cov = prior_moments(prior, d, definiteness)
         lead = (*runs, self.n_agents)
+        # Without a past the joint state is the present one.
         return {
             "joint_means": np.broadcast_to(mean, (*lead, d)).copy(),
             "joint_covariances": np.broadcast_to(cov, (*lead, d, d)).copy(),
@@ -181,6 +184,7 @@ class GaussianFilter(
             If a standard deviation after the fusion is below the rounding of its mean.
         """
         means, covs = self._forecast(step)
+        # Failed runs get a harmless Gaussian, so that the batch can go on.
         unit = np.eye(means.shape[-1])
         means = step.check_forecast(means, 0.0)
         covs = step.check_forecast(covs, unit)
@@ -290,16 +294,20 @@ class GaussianFilter(
         def moments_on_one_branch(_: Array) -> tuple[Array, Array]:
             """Return the moments about one branch, whatever the observed angle is."""
             predict = partial(group.predict, same_branch=True)
-            value, h, rest = self._linearize(predict, jacobian, mean, cov, linear)
-            return value, h @ cov @ h.mT + rest
+            value, h, remainder = self._linearize(
+                predict, jacobian, mean, cov, linear
+            )
+            return value, h @ cov @ h.mT + remainder
 
         group = step.gate(group, moments_on_one_branch, predicted[..., None, :])
+        # S = H P Hᵀ + R, where the extra covariance of the unscented points counts as noise.
         noise = np.full((*slope.shape[:-1], slope.shape[-2]), group.noise) + extra
         if joint_mean.shape[-1] > d:
             # Zero slope in the other times' states.
             joint_slope = np.zeros((*slope.shape[:-1], joint_mean.shape[-1]))
             joint_slope[..., block] = slope
             slope = joint_slope
+        # r = y* - h(m); NaN where a component is missing, which `condition` leaves out.
         innovation = group.target - predicted
         means[..., rows, :], covs[..., rows, :, :] = step.apply(
             _condition_rows,
@@ -329,6 +337,7 @@ class GaussianFilter(
         d = self.model.dim
         mean = means[..., :d]
         cov = symmetrise(covs[..., :d, :d])
+        # Only the present marginal is fused.
         fused_mean, fused_cov = step.fuse(mean, cov)
         variance = np.diagonal(fused_cov, axis1=-2, axis2=-1)
         # A variance that is negative by rounding alone is small beside the largest one.
@@ -336,6 +345,7 @@ class GaussianFilter(
             raise ValueError(
                 f"fusion must return a covariance, got a variance of {variance.min():g}"
             )
+        # A variance below (ε m)² cannot come from independent information.
         if ((variance > 0) & (variance < (EPS * fused_mean) ** 2)).any():
             warnings.warn(
                 f"covariance after fusion is below rounding at t = {step.t:g} s: "

@@ -138,6 +138,7 @@ class InformationIncrementFilter(TargetMixtureFilter):
         super().check_parts()
         if self.graph is None:
             raise ValueError("graph must be a Graph, got None")
+        # Every sensor must have the shared components.
         dims = [sensor.dim for sensors in self.agent_sensors for sensor in sensors]
         last = max(self.shared_components, default=-1)
         Bounds(below=min(dims, default=0))(last, "shared_components")
@@ -172,6 +173,7 @@ class InformationIncrementFilter(TargetMixtureFilter):
         split = [self._split_shared(of_agent) for of_agent in step.observations]
         after = []
         for agent, belief in enumerate(beliefs):
+            # The agent's own components; the shared ones follow after the exchange.
             private, _ = split[agent]
             after.append(self._condition(belief, agent, private, step)[0])
         # Each agent's belief without the information it has not sent: from before the present
@@ -233,6 +235,7 @@ class InformationIncrementFilter(TargetMixtureFilter):
         """Send the increments, and assimilate those that are received, in place."""
         for agent, messages in enumerate(step.channel.broadcast(outgoing)):
             for payload in messages.values():
+                # z = H t + unit noise, as the sender's observations.
                 increment = _unpack(payload, self.target_dim)
                 before = unsent[agent]
                 with step.failing_as(agent):
@@ -249,6 +252,7 @@ class InformationIncrementFilter(TargetMixtureFilter):
         shared: list[Observation] = []
         for observation in observations:
             value = observation.value
+            # The noise of shared components must not tell of the others'.
             is_shared = np.isin(np.arange(value.size), self.shared_components)
             noise_cov = sensor_of(self, observation).noise_cov
             if noise_cov[np.ix_(is_shared, ~is_shared)].any():
@@ -257,6 +261,7 @@ class InformationIncrementFilter(TargetMixtureFilter):
                     "components', got a sensor with correlated noise"
                 )
             for part, is_missing in ((private, is_shared), (shared, ~is_shared)):
+                # The gate and the update see the other components as missing.
                 masked = np.where(is_missing, np.nan, value)
                 if not np.isnan(masked).all():
                     part.append(observation.replace(value=masked))
@@ -265,6 +270,7 @@ class InformationIncrementFilter(TargetMixtureFilter):
 
 def _unpack(numbers: Array, n: int) -> Array:
     """Return the increment of n components, whose number of rows follows from its length."""
+    # r rows of an upper trapezoid with n + 1 columns.
     sizes = [np.triu_indices(r, 0, n + 1)[0].size for r in range(1, n + 1)]
     n_rows = sizes.index(numbers.size) + 1
     increment = np.zeros((n_rows, n + 1))

@@ -92,6 +92,7 @@ class TargetMixtureFilter(
             self._forecast(belief, agent, step)
             for agent, belief in enumerate(step.state.mixtures)
         ]
+        # Conditioning and exchange are the family's.
         after, unsent = self._assimilate(beliefs, step)
         return step.end(
             mixtures=tuple([self._reduce(belief) for belief in after]),
@@ -102,6 +103,7 @@ class TargetMixtureFilter(
 
     def _reduce(self, belief: GaussianMixture) -> GaussianMixture:
         """Merge components until `n_components` are left."""
+        # Of many components only pairs with the heaviest are candidates.
         n_pairs = max(_MAX_ALL_PAIRS, self.n_components)
         reduced = runnalls(belief, self.n_components, heaviest=n_pairs)
         # A copy without the Cholesky factors that it came with: a loaded state has none.
@@ -112,6 +114,7 @@ class TargetMixtureFilter(
         moments = [belief.moments() for belief in state.mixtures]
         mean = np.array([m for m, _ in moments])
         cov = np.array([p for _, p in moments])
+        # Recorded as an array (A,) like the other numbers.
         sizes = [float(belief.n_components) for belief in state.mixtures]
         variance = np.diagonal(cov, axis1=-2, axis2=-1)
         return Summary(mean, variance, cov, numbers={"mixands": np.array(sizes)})
@@ -192,12 +195,14 @@ class TargetMixtureFilter(
                         gate=_gate_width(value, self.gate_probability),
                         residual=sensor.residual,
                     )
+                # p(y | x) = N(y; h(x), R)
                 likelihood = (value, sensor.predict, sensor.noise_cov)
                 residual = sensor.residual
                 belief = update_mixture(belief, *likelihood, residual=residual)
                 # The same observations count for both, or their difference would hold one.
                 if second is not None:
                     second = update_mixture(second, *likelihood, residual=residual)
+            # The gate puts NaN in place of a rejected observation.
             if step.rejected is not None:
                 step.rejected[agent] += np.isnan(value).all()
         return belief, second
@@ -217,8 +222,8 @@ class MixtureFilter(TargetMixtureFilter, FusesBeliefs[MixtureState]):
 
     In a step an agent splits the components for which its model is most nonlinear, forecasts all
     of them, conditions them on its observation, sends its target marginal, fuses the marginals it
-    receives, and merges down to `n_components`. A component that cannot predict an observation (the sensor
-    gives NaN for one of its points) contradicts it and is left out; an observation that
+    receives, and merges down to `n_components`. A component that cannot predict an observation (the
+    sensor gives NaN for one of its points) contradicts it and is left out; an observation that
     contradicts all components raises an error.
 
     Parameters
@@ -296,6 +301,7 @@ class MixtureFilter(TargetMixtureFilter, FusesBeliefs[MixtureState]):
         """
         after = []
         for agent, belief in enumerate(beliefs):
+            # Observations stay with their agent.
             updated, _ = self._condition(belief, agent, step.observations[agent], step)
             after.append(updated)
         if step.has_fusion:

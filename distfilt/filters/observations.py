@@ -96,6 +96,7 @@ def read_observations(
     result: list[list[Observation]] = []
     for agent, entry in enumerate(list_by_agent(observations, f.n_agents)):
         name = f"observations[{agent}]"
+        # None, one value, one Observation, or a list of Observations.
         if entry is None:
             entries: Sequence[Any] = ()
         else:
@@ -117,6 +118,7 @@ def list_by_agent(observations: Any, n_agents: int) -> Any:
     Traceback (most recent call last):
     ValueError: observations must be a list with an entry for each of 3 agents, got 2 entries
     """
+    # A table of pandas.
     if hasattr(observations, "to_numpy"):
         observations = observations.to_numpy()
     if not isinstance(observations, Sequence | np.ndarray):
@@ -173,10 +175,12 @@ def _complete(
     dim = sensor_of(f, observation).dim
     if np.isinf(value).any():
         raise ValueError(f"{name} must be finite numbers or NaN, got infinity")
+    # Nothing was observed.
     if np.isnan(value).all():
         return None
     if value.shape == (*runs, dim):
         return observation
+    # One value for all runs is allowed.
     if value.shape != (dim,):
         raise ValueError(f"{name} must have shape {(*runs, dim)}, got {value.shape}")
     return observation.replace(value=np.broadcast_to(value, (*runs, dim)))

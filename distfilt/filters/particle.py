@@ -118,6 +118,7 @@ class ParticleFilter(
     ) -> dict[str, Any]:
         """Draw particles for each agent, with equal weights."""
         drawn = self.draw_prior(prior, (*runs, self.n_agents), rng)
+        # log(1/N)
         log_weights = np.full(drawn.shape[:-1], -np.log(self.members))
         return {"particles": drawn, "log_weights": log_weights}
 
@@ -131,6 +132,7 @@ class ParticleFilter(
             effective size of its weights is below two.
         """
         state = step.state
+        # Whole paths are resampled: the stack holds each particle's earlier states too.
         stack = step.stack(state.particles)
         log_weights = self._resample(stack, state, step)
         # Where each particle comes from: resampling has moved it from its place in the state.
@@ -148,6 +150,7 @@ class ParticleFilter(
             weights = np.exp(log_weights)
             self._select(stack, log_weights, weights, everybody, offset)
         (fused,) = step.fuse(stack[-1])
+        # The fusion moves the present particles; the earlier ones follow by regression.
         past = regress_past(stack, fused)
         after = step.end(particles=fused, log_weights=log_weights, past=past)
         self._warn(after)
@@ -156,6 +159,7 @@ class ParticleFilter(
     def summarize(self, state: ParticleState) -> Summary:
         """Return weighted moments, effective sizes and the fraction of distinct particles."""
         weights = state.weights
+        # A failed run is NaN in the record.
         mean, cov = compute_moments(state.particles, weights)
         cov = state.mask_failed(cov)
         distinct = particles.distinct_fraction(state.particles)
@@ -180,6 +184,7 @@ class ParticleFilter(
         rows = group.rows
         previous = step.before(place, group, past)
         predicted = group.predict(members[..., rows, :, :], previous)
+        # log w' = log w + log p(y | x), normalised; the gate weighs by the old weights.
         old = log_weights[..., rows, :]
         group = step.gate(group, _moments_by_logs, predicted, old)
 
@@ -227,6 +232,7 @@ class ParticleFilter(
         offset = step.rng.random((*log_weights.shape[:-1], 1))
         bandwidth = self._bandwidth(state.t, step.dt)
         noise = step.rng.standard_normal(before.shape) if bandwidth else None
+        # N_eff = 1 / Σ w²
         is_due = state.effective_size < self.ess_threshold * self.members
         if not is_due.any():
             return log_weights
@@ -278,6 +284,7 @@ class ParticleFilter(
                 stack[k][rows] = taken
             else:
                 stack[k] = taken
+        # After resampling every particle has the weight 1/N.
         log_weights[rows] = -np.log(self.members)
         return counts
 
@@ -345,6 +352,7 @@ def _moments_by_logs(predicted: Array, log_weights: Array) -> tuple[Array, Array
 
 def compute_moments(points: Array, weights: Array) -> tuple[Array, Array]:
     """Mean (..., d) and covariance (..., d, d) of points (..., N, d) with weights (..., N)."""
+    # m = Σ wᵢ xᵢ and P = Σ wᵢ (xᵢ - m)(xᵢ - m)ᵀ
     mean = (weights[..., None, :] @ points)[..., 0, :]
     # Components first, so that the weights multiply along contiguous particles.
     anomalies = np.subtract(points.mT, mean[..., None], order="C")

@@ -45,6 +45,7 @@ def plan_steps(
     >>> times, [[float(o.value[0]) for o in agent] for (agent,) in entries]
     (array([0.5, 1. ]), [[3.0], [2.0, 1.0]])
     """
+    # With events the grid may be empty: their own times are enough.
     grid = np.zeros(0) if times is None else check_array(times, "times", ("T",))
     check_increasing(grid, "times")
     if are_observations(observations) and (times is None or observations):
@@ -74,6 +75,7 @@ def _plan_events(
             raise ValueError(
                 f"observations must be of agents below {f.n_agents}, got {event.agent}"
             )
+        # Times of events alone become steps too.
         if event.t not in by_time:
             by_time[event.t] = [[] for _ in range(f.n_agents)]
         by_time[event.t][event.agent].append(event)

@@ -78,6 +78,7 @@ def prior_moments(
     mean, cov = _find_moments(prior, dim)
     mean = check_array(np.atleast_1d(mean), "prior", (dim,))
     cov = check_array(cov, "prior")
+    # In one dimension a scalar variance serves as covariance.
     is_variance = dim == cov.size == 1
     if cov.shape != (dim, dim) and not is_variance:
         raise ValueError(
@@ -110,6 +111,7 @@ def _find_moments(prior: Any, dim: int) -> tuple[Any, Any]:
         raise ValueError(
             f"prior must be (mean, cov), or have a mean and a covariance, got {kind}"
         )
+    # Members: their sample moments.
     members = check_array(prior, "prior", ("N", dim))
     if len(members) <= dim:
         raise ValueError(f"prior must have more than {dim} members, got {len(members)}")
@@ -132,19 +134,20 @@ def draw_members(
     if _is_mean_and_cov(prior):
         mean, cov = prior_moments(prior, dim)
         return draw(mean, cov, members, rng=rng, leading=leading)
-    given: Any = prior
-    if hasattr(given, "rvs"):
+    source: Any = prior
+    if hasattr(source, "rvs"):
         # scipy's name of the generator, and this package's.
-        keyword = "rng" if isinstance(given, GaussianMixture) else "random_state"
-        drawn = given.rvs(math.prod(shape[:-1]), **{keyword: rng})
+        keyword = "rng" if isinstance(source, GaussianMixture) else "random_state"
+        drawn = source.rvs(math.prod(shape[:-1]), **{keyword: rng})
         return check_array(drawn.reshape(*shape[:-1], -1), "prior", shape)
-    if callable(given):
-        given = call_user(given, members, rng=rng, leading=leading)
-    ensemble = check_array(given, "prior", (..., members, dim))
+    if callable(source):
+        source = call_user(source, members, rng=rng, leading=leading)
+    ensemble = check_array(source, "prior", (..., members, dim))
     if ensemble.shape != shape and ensemble.shape != shape[-2:]:
         raise ValueError(
             f"prior must have shape {shape} or {shape[-2:]}, got {ensemble.shape}"
         )
+    # One ensemble serves all runs and agents; a copy, since the filter updates in place.
     return np.broadcast_to(ensemble, shape).copy()
 
 

@@ -141,9 +141,11 @@ def record_run(
     names, units = f.components
     agents = list(f.agents)
     runs = start.runs
-    known = _read_truth(truth, names, (times.size, *runs), len(agents))
-    series, ledgers, last = _collect_series(f, start, believed, known, scores)
+    # The truth is checked before the first step.
+    known_truth = _read_truth(truth, names, (times.size, *runs), len(agents))
+    series, ledgers, last = _collect_series(f, start, believed, known_truth, scores)
 
+    # Axes: time first, then the runs, then the agents.
     run_axes = ["run"] if len(runs) == 1 else [f"run{i}" for i in range(len(runs))]
     lead = ("time", *run_axes, "agent")
     axes = {"covariance": (*lead, "component", "column")}
@@ -183,6 +185,7 @@ def _collect_series(
     last = start
     for block in _blocks(believed, f.batched_summary):
         first = len(ledgers) - 1
+        # The ledgers are those of the states, the estimates those of the (smoothed) beliefs.
         states = [state for state, _ in block]
         ledgers += [state.ledger for state in states]
         last = states[-1]
@@ -202,6 +205,7 @@ def _collect_series(
     if not rows:
         return {}, ledgers, last
     series = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+    # sqrt(tr P); NaN fills agents' missing components, and failed runs are NaN altogether.
     variance = series["variance"]
     spread = np.sqrt(np.nansum(variance, axis=-1))
     is_missing = np.isnan(variance).all(axis=-1)
@@ -227,6 +231,7 @@ def _blocks(believed: Iterable[Believed], batched: bool) -> Iterator[list[Believ
         )
 
     for shape, same_shape in groupby(believed, shape_of):
+        # A state that is large by itself is a block.
         size = max(1, _BLOCK_SIZE // math.prod(shape))
         block = list(islice(same_shape, size))
         while block:
@@ -268,6 +273,7 @@ def _read_components(
         raise ValueError(
             f"truth must have components of {', '.join(names)}, got {unknown}"
         )
+    # NaN where nothing is known, so that no score is computed there.
     values = np.full((*shape, n_agents, len(names)), np.nan)
     for name, entry in truth.items():
         series = check_array(entry, f"truth[{name!r}]", None)
@@ -291,10 +297,12 @@ def _score(
     is_finite = np.isfinite(known_mean) & np.isfinite(known_truth)
     is_scored = np.asarray(is_finite.all(axis=-1))
     if "squared_error" in scores:
+        # Component by component; the total leaves out the unknown ones.
         squared = (mean - truth) ** 2
         result["squared_error"] = squared
         result["total_squared_error"] = squared[..., components].sum(axis=-1)
     if "crps" in scores:
+        # In closed form for a Gaussian, from the sorted members for an ensemble.
         if summary.members is None:
             value = gaussian_crps(mean, np.sqrt(summary.variance), truth)
         else:
@@ -356,6 +364,7 @@ def final_state(run: xarray.Dataset) -> State:
     encoding = getattr(run, "encoding", {})
     if "final_state" in encoding and "mean" in run and run["time"].size:
         state, agents, last_mean = encoding["final_state"]
+        # A selection inherits the entry, but not all agents and times.
         has_agents = list(run["agent"].values) == agents
         has_end = np.array_equal(run["time"].values[-1], state.t)
         if has_agents and has_end:
@@ -369,6 +378,7 @@ def final_state(run: xarray.Dataset) -> State:
 
 def _count_messages(name: str, ledgers: list[Ledger]) -> dict[str, Any]:
     """Return one field of the ledgers as variables: in each step, and up to then."""
+    # The first ledger is that of the state before the run.
     total = np.array([getattr(ledger, name) for ledger in ledgers])
     axes = ("time", "agent")[: total.ndim]
     unit = "B" if name == "bytes" else "1"

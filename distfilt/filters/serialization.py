@@ -44,6 +44,7 @@ def save_state(state: Any, path: str | PathLike[str]) -> None:
     buffer = io.BytesIO()
     named: dict[str, Any] = {f"a{k}": array for k, array in enumerate(arrays)}
     np.savez(buffer, header=np.array(json.dumps(header)), **named)
+    # The check sum stands behind the content, so that a cut file is found too.
     content = buffer.getvalue()
     # Written beside the file and then renamed, which a file system does at once.
     unfinished = Path(path).with_name(f".{Path(path).name}.part")
@@ -122,6 +123,7 @@ def _decode(encoded: Any, arrays: dict[str, Any]) -> Any:
     if "rng" in encoded:
         return _decode_rng(*[_decode(part, arrays) for part in encoded["rng"]])
     items = {name: _decode(item, arrays) for name, item in encoded["dict"].items()}
+    # A plain dictionary, or the fields of a dataclass.
     if "of" not in encoded:
         return items
     return _find_class(encoded["of"])(**items)

@@ -79,6 +79,7 @@ class State(FrozenModel):
         ... )
         ((0.0,), [(0.0,), (0.0,), (0.0,), (), (1.0,), (0.0, 1.0)])
         """
+        # A step of no length keeps the past as it is.
         if t == self.t:
             return self.times
         return (*self.times, self.t)[-lag:] if lag else ()
@@ -210,6 +211,7 @@ class SensorState(State):
 def stack_states(states: Sequence[AnyState]) -> AnyState:
     """Stack several states of one shape, with a first axis of runs."""
     first = states[0]
+    # Everything else, such as the time, is taken from the first state.
     arrays = {}
     for name, value in vars(first).items():
         if type(value) is np.ndarray:

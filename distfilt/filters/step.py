@@ -111,9 +111,11 @@ class Step(Generic[S]):
         # A family's next_state knows the fields of its own state.
         self.state: Any = state
         self.t = t
+        # At the state's own time nothing is forecast: dt = 0.
         self.dt = t - state.t
         self.observations = observations
         self.delayed = delayed
+        # A state may keep a past although the filter has no lag; only a forecast drops it.
         has_past = filter_.lag > 0 or self.dt == 0
         self.times = state.lagged_times(filter_.lag, t) if has_past else ()
         # Any, since a family that needs a channel has made sure that there is one.
@@ -130,6 +132,7 @@ class Step(Generic[S]):
         # Whether there is a fusion rule, and a channel to use it.
         self.has_fusion = filter_.fusion is not None and self.channel is not None
         self.pending: tuple[Observation, ...] = ()
+        # Counted only with a gate.
         self.rejected: Array | None = None
         if filter_.gate_probability is not None:
             self.rejected = np.zeros((*self.runs, filter_.n_agents))
@@ -139,6 +142,7 @@ class Step(Generic[S]):
     def check_forecast(self, values: Array, old: Array | float) -> Array:
         """Return a finite forecast (*runs, A, ...), and `old` in failed runs."""
         if not np.isfinite(values).all():
+            # One row for each run and agent.
             lead = len(self.runs) + 1
             errors = failures.find_nonfinite_rows(values, lead, "forecast")
             self.record_failures(errors, range(self.filter.n_agents))
@@ -152,9 +156,12 @@ class Step(Generic[S]):
         """Return copies of the beliefs about the earlier times, then the present forecast."""
         if not self.times:
             return [forecast]
+        # The beliefs before the step: about the earlier times, and about the state's own time,
+        # which is one of the earlier ones after a forecast.
         before = [belief for _, belief in self.state.history]
         if self.dt > 0:
             before.append(self.state.belief)
+        # With a full lag the oldest time is dropped.
         oldest = len(before) - len(self.times)
         return [belief.copy() for belief in before[oldest:]] + [forecast]
 
@@ -162,6 +169,7 @@ class Step(Generic[S]):
         """Return the values, but `old` in failed runs."""
         if not self.any_failed:
             return values
+        # The flags (*runs) get axes of size 1 behind, to broadcast against the values.
         trailing = (1,) * (values.ndim - self.failed.ndim)
         failed = self.failed.reshape(*self.runs, *trailing)
         return np.asarray(np.where(failed, old, values))
@@ -174,11 +182,12 @@ class Step(Generic[S]):
         Each comes with its place among the times, of which the last is now. The target is NaN in
         failed runs, so that they are left alone.
         """
-        known = self._known_observations()
+        by_time = self._known_observations()
         for place, t in enumerate((*self.times, self.t)):
-            if t not in known:
+            if t not in by_time:
                 continue
-            for group in group_agents(known[t]):
+            # Agents with equally many numbers are one group.
+            for group in group_agents(by_time[t]):
                 if self.any_failed:
                     group = group.with_target(self.keep_failed(group.target, np.nan))
                 yield place, group
@@ -229,6 +238,7 @@ class Step(Generic[S]):
         # About one prediction: opposite to a wild angle the branch cut would divide them.
         aligned = group.wrap_near(predicted.copy(), predicted[..., :1, :])
         mean, cov = moments(aligned, *args)
+        # A filter with a gate has a probability.
         probability = cast(float, self.filter.gate_probability)
         group, rejected = group.gate(mean, cov, probability)
         self.rejected[..., group.agents] += rejected
@@ -266,11 +276,13 @@ class Step(Generic[S]):
             The results; failures are recorded, or raised if the filter says so.
         """
         lead = len(self.runs) + (agents is not None)
+        # The state of the generator, to draw the same numbers in a second attempt.
         is_batch = math.prod(arrays[0].shape[:lead]) > 1
         rng_state: Any = None
         if rng is not None and is_batch:
             rng_state = rng.bit_generator.state
         errors: dict[Row, str] = {}
+        # The plain way: one call for the whole batch.
         try:
             results = compute(*arrays, shared, rng)
         except RECOVERABLE as error:
@@ -284,10 +296,12 @@ class Step(Generic[S]):
                 rng_state=rng_state,
                 cause=error,
             )
+        # A row may also fail without an error, by overflow for instance.
         for values in results:
             if not np.isfinite(values).all():
                 errors |= failures.find_nonfinite_rows(values, lead, "result")
         if errors:
+            # Failed rows keep their values from before the computation.
             results = tuple([values.copy() for values in results])
             for row in errors:
                 for values, old in zip(results, fallback, strict=True):
@@ -302,11 +316,13 @@ class Step(Generic[S]):
         """
         if not errors:
             return
+        # The first error is raised; with "keep" all of them are marked.
         n_axes = len(self.runs)
         row, why = next(iter(errors.items()))
         if self.filter.on_error == "raise" or not self.runs:
             agent = None if agents is None else int(agents[row[-1]])
             raise FilterError(row[:n_axes], agent, self.t, why)
+        # The flags of the state before the step stay as they are.
         self.failed = self.failed.copy()
         for row in errors:
             self.failed[row[:n_axes]] = True
@@ -361,10 +377,12 @@ class Step(Generic[S]):
         """
         state = self.state
         if isinstance(state, SensorState):
+            # A family may keep its past in its own form; otherwise it is (time, belief) pairs.
             if "history" not in belief:
                 belief["history"] = tuple(zip(self.times, past, strict=True))
             belief["failed"] = self.failed
             belief["pending"] = self.pending
+        # The messages in the step are in the channel's ledger.
         ledger = state.ledger if self.channel is None else self.channel.ledger
         new: S = type(state).construct(
             self.t, ledger, self.rng, rejected=self.rejected, **belief
@@ -420,6 +438,7 @@ class Received:
         self, agents: list[int], sensors: Sequence[tuple[Sensor, ...]]
     ) -> None:
         self.agents = np.array(agents, dtype=np.intp)
+        # A slice gives views, where a list of numbers copies.
         is_everybody = agents == list(range(len(sensors)))
         self.rows: Any = slice(None) if is_everybody else self.agents
         size = sum(sensor.dim for sensor in sensors[agents[0]])
@@ -470,6 +489,7 @@ class Received:
 
     def with_target(self, target: Array) -> Received:
         """Return the same group with these observed values."""
+        # The plan is shared: only the values differ from step to step.
         result = object.__new__(Received)
         vars(result).update(vars(self), target=target)
         return result
@@ -492,6 +512,7 @@ class Received:
         # Numbers before states, so that the cells of a sensor are one index.
         result = np.empty((*states.shape[:-2], self.target.shape[-1], n_states))
         for part in self.parts:
+            # Only sensors that measure a change need the previous states.
             before = None if previous is None else previous[..., part.agents, :, :]
             values = self._predict_part(part, states[..., part.agents, :, :], before)
             result[(..., *part.cells, slice(None))] = values.swapaxes(-1, -2)
@@ -525,8 +546,10 @@ class Received:
         if not self.wraps:
             return predicted
         values = predicted.swapaxes(-1, -2)
+        # The reference for every state, NaN where the prediction is.
         full = (reference + 0 * predicted).swapaxes(-1, -2)
         for part in self.parts:
+            # A difference that does not wrap has one branch.
             if part.sensor.residual_function is None:
                 continue
             index = (..., *part.cells, slice(None))
@@ -548,6 +571,7 @@ class Received:
             return np.full((*self.target.shape, d), self.H(d))
         result = np.empty((*self.target.shape, d))
         for part in self.parts:
+            # H of the sensor's agents, (*runs, agents, m, d)
             rows = (..., part.agents, slice(None))
             slope = part.sensor.jacobian(states[rows], std=std[rows])
             result[(..., *part.cells, slice(None))] = slope
@@ -586,8 +610,8 @@ class Received:
             present = (self.sensor_index == k) & ~np.isnan(innovation)
             size = present.sum(axis=-1)
             # Other sensors' numbers have a zero innovation and a unit covariance.
-            both = present[..., :, None] & present[..., None, :]
-            part_cov = np.where(both, innovation_cov, unit)
+            present_pairs = present[..., :, None] & present[..., None, :]
+            part_cov = np.where(present_pairs, innovation_cov, unit)
             part = np.where(present, innovation, 0.0)
             # ε = rᵀ S⁻¹ r ~ χ²(m), whose quantile is 2 P⁻¹(m / 2, probability).
             solved = np.linalg.solve(part_cov, part[..., None])[..., 0]
@@ -620,6 +644,7 @@ def group_agents(
     >>> group_agents([[], []])
     []
     """
+    # The pattern of sensors is the key of the plan.
     pattern = tuple([tuple([s for s, _ in pairs]) for pairs in observations])
     groups = []
     for plan in _plan_groups(pattern):
@@ -647,5 +672,6 @@ def copy_rng(rng: np.random.Generator) -> np.random.Generator:
         return copy.deepcopy(rng)
     old: Any = rng.bit_generator
     new = type(old)(_UNSEEDED)
+    # The seed sequence counts its children, so that each copy needs one of its own.
     new.__setstate__((old.state, copy.copy(old.seed_seq)))
     return np.random.Generator(new)

@@ -17,6 +17,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from ..linalg import deviations
 from ..models import Model
 from ..sensors import Sensor, stack
 from ..validation import (

@@ -12,6 +12,7 @@ from ..validation import ArrayInput, Bounds, PositiveInt, validated
 __all__ = ["Interval", "mean_interval", "median_interval", "proportion_interval"]
 
 Values = Annotated[ArrayInput, "n"]
+# At a level near 0 quantiles lose their digits.
 Level = Annotated[float, Bounds(at_least=1e-9, below=1)]
 
 
@@ -157,6 +158,7 @@ def proportion_interval(
     if k < n:
         high = float(betaincinv(k + 1, n - k, 1 - tail))
     proportion = k / n
+    # The standard deviation of k / n at the estimated probability.
     error = float(np.sqrt(proportion * (1 - proportion) / n))
     # At a level near 0 the ends may pass each other; the estimate stays inside.
     low = min(low, proportion)

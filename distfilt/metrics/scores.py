@@ -56,6 +56,7 @@ def squared_error(estimate: Vector, truth: Vector) -> Array:
     25.0
     """
     broadcast_leading(estimate.shape[:-1], truth.shape[:-1], "truth")
+    # |x - y|²
     return np.asarray(((estimate - truth) ** 2).sum(axis=-1))
 
 
@@ -155,6 +156,7 @@ def nees_band(
     """
     from scipy.special import gammaincinv
 
+    # The sum of `count` values has count · dim degrees of freedom.
     tail = (1 - level) / 2
     total = count * dim
     unit = total if normalised else count
@@ -250,6 +252,7 @@ def gaussian_crps(
 
     shape = broadcast_leading(mean.shape, std.shape, "std")
     broadcast_leading(shape, truth.shape, "truth")
+    # In units of the standard deviation the score depends on z only.
     z = (truth - mean) / std
     density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
     score = z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi)

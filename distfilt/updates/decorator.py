@@ -418,12 +418,22 @@ _EVENTS: dict[str, tuple[str, ...]] = {
     "multivariate_normal": ("mean", "cov"),
 }
 """The same for draws that are vectors, or are made from a list: all rows share parameters."""
+_OPTIONS: dict[str, tuple[str, ...]] = {
+    "choice": ("replace", "p", "axis", "shuffle"),
+    "integers": ("dtype", "endpoint"),
+    "multivariate_hypergeometric": ("method",),
+    "random": ("dtype", "out"),
+    "standard_exponential": ("dtype", "method", "out"),
+    "standard_gamma": ("dtype", "out"),
+    "standard_normal": ("dtype", "out"),
+}
+"""Further arguments that may be given by position, after ``size``."""
 
 
 def _draw_rows(name: str, parameters: tuple[str, ...], by_row: bool) -> Any:
     """Return the method of a distribution that draws for the batch and selects the rows."""
     draw = getattr(np.random.Generator, name)
-    names = (*parameters, "size")
+    names = (*parameters, "size", *_OPTIONS.get(name, ()))
 
     def method(self: RowGenerator, *args: Any, **options: Any) -> Any:
         bound = dict(zip(names, args, strict=False)) | options
@@ -434,15 +444,13 @@ def _draw_rows(name: str, parameters: tuple[str, ...], by_row: bool) -> Any:
             shape = np.broadcast_shapes(*given)
         else:
             shape = tuple(size) if np.iterable(size) else ()
-        if not self._has_rows(shape) or len(args) > len(names):
+        if not self._has_rows(shape):
             return draw(self, *args, **options)
-        if by_row:
-            for p in parameters:
-                if bound.get(p) is not None:
-                    bound[p] = self._spread(bound[p], len(shape))
+        for p in parameters:
+            if by_row and bound.get(p) is not None:
+                bound[p] = self._spread(bound[p], len(shape))
         bound["size"] = (*self.lead, *shape[1:])
         out = bound.pop("out", None)
-        # As many positional arguments as numpy needs: some have no names.
         draws = draw(self, **bound)
         n_rows = math.prod(self.lead)
         selected = draws.reshape(n_rows, *draws.shape[len(self.lead) :])[self.rows]

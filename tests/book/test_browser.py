@@ -143,6 +143,7 @@ def visit(driver: Any, page: Path) -> Visit:
             report = driver.execute_script(REPORT)
             rules = {theme: driver.execute_script(RULES, theme) for theme in THEMES}
         fit[width] = driver.execute_script(FIT)
+    # After the reports, since it changes the page.
     sliders = driver.execute_async_script(MOVE)
     entries = [json.loads(entry["message"]) for entry in driver.get_log("performance")]
     requests = requests_of(entries, driver.current_window_handle)
@@ -206,6 +207,7 @@ def content_pages() -> list[Path]:
 @pytest.fixture(scope="module")
 def visits(driver: Any) -> dict[Path, Visit]:
     """Visit every page; of the pages with a module's source only the longest."""
+    # These pages have one form; the longest is the hardest.
     listings = {page for page in content_pages() if "_modules" in page.parts}
     longest = max(listings, key=lambda page: page.stat().st_size)
     return {

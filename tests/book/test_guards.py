@@ -181,6 +181,7 @@ FAULTS: dict[str, tuple[int, Callable[[Any], object], str]] = {
 def test_one_changed_output_or_source_fails_and_no_other(
     executed: Path, folder: Path
 ) -> None:
+    # The unchanged cells come first, then one changed cell for each fault.
     cells = code_cells(read_notebook(executed / "small.md"))
     untouched = len(cells)
     assert pairs.check(executed / "small.md") == []
@@ -205,12 +206,14 @@ def test_one_changed_output_or_source_fails_and_no_other(
 
 def test_pixels_may_differ_if_few_or_little(executed: Path) -> None:
     png = bundle(code_cells(read_notebook(executed / "small.md"))[FIGURE])["image/png"]
+    # 0.2 % of the pixels by a large shade is too much, 0.01 % is accepted.
     assert difference(shade_pixels(png, 0.002, 120), png).startswith("differs in 0.2")
     assert difference(shade_pixels(png, 0.0001, 120), png) == ""
     assert difference(png, "a") == "is no picture"
 
 
 def test_a_lighter_picture_shows_the_same() -> None:
+    # Noise of 64 colours fits a palette, noise of all colours does not.
     noise = np.random.default_rng(1).integers(0, 256, (200, 200, 3))
     few_colours = as_png(noise // 64 * 80)
     many_colours = as_png(noise)

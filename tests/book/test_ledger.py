@@ -40,6 +40,7 @@ def test_ledger_has_every_item_once() -> None:
         assert not powerless_claims(
             row
         )  # on its null's numbers each rule judges otherwise
+        # Without a null, no claim has power.
         assert len(claims_of(row)) == len(powerless_claims(row | {"null": ""}))
 
 

@@ -33,6 +33,7 @@ def clone(tmp_path: Path) -> Path:
 
 
 def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    # The outer make passes its own options in these variables.
     env = {k: v for k, v in os.environ.items() if not k.startswith("MAKE")}
     return subprocess.run(
         ["make", *arguments], cwd=folder, env=env, capture_output=True, text=True
@@ -62,6 +63,7 @@ def test_only_a_whole_environment_is_kept(clone: Path) -> None:
     python = clone / ".venv" / "bin" / "python"
     stamp.write_text(f"{clone}\n")
     assert not makes_environment(clone)
+    # A stamp older than the lock: the packages have to be installed again.
     os.utime(stamp, (1, 1))
     assert makes_environment(clone)
     os.utime(stamp)
@@ -73,6 +75,7 @@ def test_only_a_whole_environment_is_kept(clone: Path) -> None:
 
 def test_a_moved_or_copied_folder_makes_its_own(clone: Path, tmp_path: Path) -> None:
     pretend(clone, str(clone))
+    # The stamp names the old folder, to which the editable install points.
     copied = tmp_path / "copied"
     shutil.copytree(clone, copied, symlinks=True)
     assert makes_environment(copied) and not makes_environment(clone)

@@ -93,8 +93,11 @@ def model() -> LinearModel:
 
 def team(agents: int = 5) -> list[Sensor | None]:
     """Sensors of one, two (correlated) and no readings in turn."""
-    both = Sensor(2, lambda x: x, NOISE, linear=lambda d: np.eye(d))
-    return [[component([0], std=0.6), both, None][k % 3] for k in range(agents)]
+    position_and_velocity = Sensor(2, lambda x: x, NOISE, linear=lambda d: np.eye(d))
+    return [
+        [component([0], std=0.6), position_and_velocity, None][k % 3]
+        for k in range(agents)
+    ]
 
 
 TIMES = np.cumsum([0.1, 0.3, 0.2, 0.4, 0.1, 0.2, 0.3, 0.2])
@@ -122,7 +125,7 @@ def kalman(seen: Any, sensors: Any) -> tuple[Any, dict[str, Any]]:
     return kalman_filter(*PRIOR, y, H=every.H(2), R=every.noise_cov, **moves), moves
 
 
-def made(family: str, agents: int = 5, **options: Any) -> tuple[Any, Any]:
+def make_filter(family: str, agents: int = 5, **options: Any) -> tuple[Any, Any]:
     """A filter of a family on a path of agents, and its state at the start."""
     if family.endswith("common") and options.get("fusion", 0) is None:
         del options["fusion"]  # one round of averaging, which is as far as readings go

@@ -39,7 +39,7 @@ FAMILIES: dict[str, Any] = {
 
 
 def batch(known: list[Any], times: Any, q: Any, run: Any) -> tuple[Any, Any]:
-    """Means (K, 2) and covariances (K, 2, 2) at all times, given what is known in one run."""
+    """Means (K, 2) and covariances (K, 2, 2) at all times, given the observations of one run."""
     lift = np.eye(2 * len(times))
     steps = np.diff(times)
     for k, dt in enumerate(steps, 1):
@@ -50,13 +50,15 @@ def batch(known: list[Any], times: Any, q: Any, run: Any) -> tuple[Any, Any]:
     h = np.zeros((0, len(mean)))
     r = np.zeros((0, 0))
     y = np.zeros(0)
-    for sensor, said in known:
-        value = said.value[run] if said.value.ndim > 1 else said.value
-        here = ~np.isnan(value)
-        at = np.eye(len(times))[times.tolist().index(said.t)]
-        h = np.concatenate([h, np.kron(at, sensor.H(2))[here]])
-        r = block_diag(r, sensor.noise_cov[np.ix_(here, here)])
-        y = np.concatenate([y, value[here]])
+    for sensor, observation in known:
+        value = (
+            observation.value[run] if observation.value.ndim > 1 else observation.value
+        )
+        arrived = ~np.isnan(value)
+        place = np.eye(len(times))[times.tolist().index(observation.t)]
+        h = np.concatenate([h, np.kron(place, sensor.H(2))[arrived]])
+        r = block_diag(r, sensor.noise_cov[np.ix_(arrived, arrived)])
+        y = np.concatenate([y, value[arrived]])
     gain = np.linalg.solve(h @ cov @ h.T + r, h @ cov).T
     mean = mean + gain @ (y - h @ mean)
     cov = cov - gain @ h @ cov
@@ -67,15 +69,68 @@ def batch(known: list[Any], times: Any, q: Any, run: Any) -> tuple[Any, Any]:
 
 def price(told: list[Any], now: float) -> Any:
     """Numbers that are there, and of each reading when it was, of which sensor, and about it."""
-    there = [
-        ~np.isnan(said.value.reshape(-1, sensor.dim)).all(axis=0)
-        for sensor, said in told
+    receivers = [
+        ~np.isnan(observation.value.reshape(-1, sensor.dim)).all(axis=0)
+        for sensor, observation in told
     ]
-    numbers = sum(map(np.sum, there))
-    (sensor, said), *more = told
-    if not more and said.t == now and not said.metadata and said.sensor in (0, sensor):
+    numbers = sum(map(np.sum, receivers))
+    (sensor, observation), *more = told
+    if (
+        not more
+        and observation.t == now
+        and not observation.metadata
+        and observation.sensor in (0, sensor)
+    ):
         return numbers
-    return numbers + sum(2 + len(said.metadata) for _, said in told)
+    return numbers + sum(2 + len(observation.metadata) for _, observation in told)
+
+
+def draw_events(
+    rng: Any,
+    team: list[list[Sensor]],
+    times: np.ndarray,
+    runs: tuple[int, ...],
+    lag: int,
+    several: bool,
+) -> list[tuple[float, Sensor, Observation]]:
+    """Draw observations of all times, each with its sensor and the step in which it arrives.
+
+    An arrival at k is in the first step to the time k, one at k + 1/2 in a second step to it.
+    """
+    steps = times.size - 1
+    events = []
+    for j, a in np.ndindex(steps + 1, len(team)):
+        for s, sensor in enumerate(team[a]):
+            value = rng.normal(size=(*runs[: rng.integers(2)], sensor.dim))
+            value[rng.random(value.shape) < 0.2] = np.nan
+            k = j + several * rng.integers(2) * rng.integers(lag + 1)
+            # A sensor of the observation's own travels with its metadata.
+            is_private = rng.random() < 0.2
+            which = sensor if is_private else s
+            metadata = tuple(rng.random(is_private * rng.integers(3)))
+            if 0 < k <= steps and not np.isnan(value).all():
+                observation = Observation(times[j], a, value, which, metadata=metadata)
+                events.append((k + rng.integers(2) / 2, sensor, observation))
+    return events
+
+
+def check_beliefs(
+    views: list[tuple[float, Any]],
+    available: list[Any],
+    times: np.ndarray,
+    q: np.ndarray,
+    runs: tuple[int, ...],
+) -> None:
+    """Compare every agent's beliefs about all times kept with one batch of its observations."""
+    for a, *run in np.ndindex(len(available), *runs):
+        means, covs = batch(available[a], times, q, tuple(run))
+        for t, view in views:
+            place = times.tolist().index(t)
+            index = (*run, a)
+            cov = view.covariance
+            result = np.cov(view.members[index].T) if cov is None else cov[index]
+            assert np.allclose(view.mean[index], means[place], atol=1e-9)
+            assert np.allclose(result, covs[place], atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -117,20 +172,8 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
     prior: Any = PRIOR  # or members of these moments, which exact updates keep
     if family == "ensemble":
         prior = match_moments(rng.standard_normal((120, 2)), *PRIOR)
-    events = []
-    for j, a in np.ndindex(steps + 1, agents):
-        for s, sensor in enumerate(team[a]):
-            value = rng.normal(size=(*runs[: rng.integers(2)], sensor.dim))
-            value[rng.random(value.shape) < 0.2] = np.nan
-            k = j + several * rng.integers(2) * rng.integers(lag + 1)
-            which = sensor if (own := rng.random() < 0.2) else s
-            about = tuple(rng.random(own * rng.integers(3)))
-            if (
-                0 < k <= steps and not np.isnan(value).all()
-            ):  # in the first step to k, or a second
-                said = Observation(times[j], a, value, which, metadata=about)
-                events.append((k + rng.integers(2) / 2, sensor, said))
-    known = [[] for _ in team]
+    events = draw_events(rng, team, times, runs, lag, several)
+    available = [[] for _ in team]
     waiting = [[] for _ in team]
     owed = np.zeros(agents)
     state = f.start(prior, rng=rng, runs=runs, t=times[0])
@@ -141,15 +184,23 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
             [event[1:] for event in events if event[0] == when and event[2].agent == a]
             for a in range(agents)
         ]
-        late = [said for own in now for _, said in own if said.t < t]
-        seen = [[said for _, said in own if said.t == t] for own in now]
+        late = [
+            observation
+            for private in now
+            for _, observation in private
+            if observation.t < t
+        ]
+        seen = [
+            [observation for _, observation in private if observation.t == t]
+            for private in now
+        ]
         state = f.step(state, t, seen, **({"delayed": late} if several else {}))
-        for a, own in enumerate(now):
-            known[a] += own
-            waiting[a] += own
+        for a, private in enumerate(now):
+            available[a] += private
+            waiting[a] += private
             if share and contact[k] and waiting[a] and not (every and when > k):
                 for b in np.flatnonzero(links[k, :, a]):
-                    known[b] += waiting[a]
+                    available[b] += waiting[a]
                     owed[a] += price(waiting[a], t)
                 waiting[a] = []
         assert family == "news" or np.array_equal(state.ledger.scalars, owed)
@@ -158,12 +209,4 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
             for then in (state, *getattr(state, "lagged_states", ()))
         ]
         assert len(views) == 1 + min(lag * several, k)
-        for a, *run in np.ndindex(agents, *runs):
-            means, covs = batch(known[a], times[: k + 1], q, tuple(run))
-            for then, view in views:
-                at = times.tolist().index(then)
-                here = (*run, a)
-                cov = view.covariance
-                found = np.cov(view.members[here].T) if cov is None else cov[here]
-                assert np.allclose(view.mean[here], means[at], atol=1e-9)
-                assert np.allclose(found, covs[at], atol=1e-9)
+        check_beliefs(views, available, times[: k + 1], q, runs)

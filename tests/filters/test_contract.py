@@ -1,4 +1,4 @@
-"""What every family keeps to, whatever the update and the agreement: one test for all."""
+"""The contract of every family, whatever the update and the fusion rule: one test for all."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from distfilt.models import LinearModel, Model
 from distfilt.network import Faults
 from distfilt.sensors import Sensor, bearing, component
 
-from .families import FAMILIES, PRIOR, TIMES, data, made, rules, team, values
+from .families import FAMILIES, PRIOR, TIMES, data, make_filter, rules, team, values
 
 EACH = pytest.mark.parametrize("family", FAMILIES)
 pytestmark = pytest.mark.filterwarnings("ignore::distfilt.filters.ParticleCollapse")
@@ -35,7 +35,7 @@ def at(observations: list[Any], k: int) -> list[Any]:
 )
 def test_nobody_notices_beyond_the_neighbours(family: str, rule: Any) -> None:
     """On a path 0-1-2-3-4 a step reaches one link: agents 0, 1, 2 know nothing of agent 4."""
-    f, start = made(family, fusion=rule)
+    f, start = make_filter(family, fusion=rule)
     _, seen = data(f.sensors)
     start = f.step(start, TIMES[0], at(seen, 0))
     changed = {n: v.copy() for n, v in values(start).items()}
@@ -49,10 +49,10 @@ def test_nobody_notices_beyond_the_neighbours(family: str, rule: Any) -> None:
     fields = {k: getattr(start, k) for k in start.__dataclass_fields__} | changed
     other = f.step(type(start)(**fields), TIMES[1], at(seen, 1))
     plain = f.step(start, TIMES[1], at(seen, 1))
-    both = [(v, values(other)[name]) for name, v in values(plain).items()]
+    pairs = [(v, values(other)[name]) for name, v in values(plain).items()]
     # Products of a smaller batch round differently, and nothing else may.
-    assert all(np.allclose(v[:3], w[:3], rtol=0, atol=1e-13) for v, w in both)
-    assert any((v[4] != w[4]).any() for v, w in both)
+    assert all(np.allclose(v[:3], w[:3], rtol=0, atol=1e-13) for v, w in pairs)
+    assert any((v[4] != w[4]).any() for v, w in pairs)
 
 
 @EACH
@@ -60,18 +60,18 @@ def test_faults_between_two_times(family: str) -> None:
     """Agent 0's radio is off from 1 s to before 2 s: who hears it is blind at 1 s only."""
     off = Faults(silent=[0], during=[(1.0, 2.0)])
     sensors = [component([0], std=0.5), None]
-    f, state = made(family, sensors=sensors, fusion=None, faults=off)
-    heard = []
+    f, state = make_filter(family, sensors=sensors, fusion=None, faults=off)
+    was_sent = []
     for t in (0.5, 1.0, 2.0):
         before = state
         state = f.step(state, t, [[0.3], None])
-        heard.append(bool((state.ledger.messages - before.ledger.messages)[0]))
-    assert heard == [True, False, True]
+        was_sent.append(bool((state.ledger.messages - before.ledger.messages)[0]))
+    assert was_sent == [True, False, True]
 
 
 @EACH
 def test_recorded_scores_by_their_definitions(family: str) -> None:
-    f, start = made(family, runs=(3,), agents=3, names=("A", "B", "C"))
+    f, start = make_filter(family, runs=(3,), agents=3, names=("A", "B", "C"))
     truth, seen = data(f.sensors, (3,))
     run = f.run(start, TIMES, seen, truth=truth)
     states = list(f.steps(start, TIMES, seen))
@@ -81,9 +81,9 @@ def test_recorded_scores_by_their_definitions(family: str) -> None:
     k = 5
     r = 1
     a = 2
-    got = run.isel(time=k, run=r, agent=a)
+    entry = run.isel(time=k, run=r, agent=a)
     true = truth[k, r]
-    mean = got["mean"].values
+    mean = entry["mean"].values
     if family.startswith("gaussian"):
         assert np.allclose(mean, states[k].means[r, a])
         cov = states[k].covariances[r, a]
@@ -107,15 +107,17 @@ def test_recorded_scores_by_their_definitions(family: str) -> None:
         "spread": np.sqrt(np.trace(cov)),
     }
     for name, value in wanted.items():
-        assert np.allclose(got[name].values, value, rtol=1e-9, atol=1e-12), name
+        assert np.allclose(entry[name].values, value, rtol=1e-9, atol=1e-12), name
 
 
 @EACH
 def test_missing_component_is_a_sensor_without_it(family: str) -> None:
     sensors = [team(2)[1]]
-    f, start = made(family, sensors=sensors, graph=None)
+    f, start = make_filter(family, sensors=sensors, graph=None)
     y = np.array([0.4, np.nan])
-    less = made(family, sensors=[component([0], std=np.sqrt(0.5))], graph=None)[0]
+    less = make_filter(family, sensors=[component([0], std=np.sqrt(0.5))], graph=None)[
+        0
+    ]
     a = f.step(start, 0.5, [y])
     b = less.step(start, 0.5, [[0.4]])
     assert np.allclose(f.summarize(a).mean, less.summarize(b).mean, atol=1e-12)
@@ -125,13 +127,13 @@ def test_missing_component_is_a_sensor_without_it(family: str) -> None:
 @EACH
 def test_components_missing_in_some_runs_only(family: str) -> None:
     sensors = [team(2)[1]]
-    f, start = made(family, sensors=sensors, graph=None, runs=(3,))
+    f, start = make_filter(family, sensors=sensors, graph=None, runs=(3,))
     y = np.array([[0.4, 0.1], [np.nan, 0.1], [np.nan, np.nan]])
-    out = f.summarize(f.step(start, 0.5, [y]))
+    missing = f.summarize(f.step(start, 0.5, [y]))
     blind = f.summarize(f.step(start, 0.5, [None]))
-    assert np.allclose(out.mean[2], blind.mean[2], atol=1e-12)
-    assert np.allclose(out.variance[2], blind.variance[2], atol=1e-12)
-    assert (np.abs(out.mean[:2] - blind.mean[:2]).max(axis=(1, 2)) > 1e-3).all()
+    assert np.allclose(missing.mean[2], blind.mean[2], atol=1e-12)
+    assert np.allclose(missing.variance[2], blind.variance[2], atol=1e-12)
+    assert (np.abs(missing.mean[:2] - blind.mean[:2]).max(axis=(1, 2)) > 1e-3).all()
 
 
 @EACH
@@ -142,7 +144,7 @@ def test_direction_across_pi(family: str) -> None:
         bearing([0, 1], std=0.05),
         component([0], std=0.1),
     ]
-    f = made(family, sensors=sensors, model=still)[0]
+    f = make_filter(family, sensors=sensors, model=still)[0]
     prior = (np.array([-2.0, 0.0]), 0.04 * np.eye(2))
     start = f.start(prior, rng=np.random.default_rng(0), runs=(20,))
     rng = np.random.default_rng(1)
@@ -168,7 +170,7 @@ def test_time_passes_to_model_and_noise(family: str) -> None:
         calls.append(("noise", t, dt))
         return (0.1 + t) * dt * np.eye(2)
 
-    f = made(family, sensors=[None], graph=None, model=Model(2, flow, noise))[0]
+    f = make_filter(family, sensors=[None], graph=None, model=Model(2, flow, noise))[0]
     state = f.start(PRIOR, rng=np.random.default_rng(0), t=2.0)
     state = f.step(state, 2.5, [None])
     state = f.step(state, 3.5, [None])
@@ -180,7 +182,7 @@ def test_time_passes_to_model_and_noise(family: str) -> None:
 def test_late_reading_is_in_time_after_all(family: str) -> None:
     """For who heard of it too, as near as the members' number allows."""
     two: dict[str, Any] = {"sensors": [component([0], std=0.4), None], "fusion": None}
-    f, start = made(family, **two, lag=2, runs=(40,))
+    f, start = make_filter(family, **two, lag=2, runs=(40,))
     for t in (0.5, 1.0):
         start = f.step(start, t, [None] * 2)
     late = f.step(
@@ -189,7 +191,7 @@ def test_late_reading_is_in_time_after_all(family: str) -> None:
         [[0.1], None],
         delayed=[Observation(0.5, 0, [1.9], arrival_time=1.5)],
     )
-    g, begin = made(family, **two, runs=(40,))
+    g, begin = make_filter(family, **two, runs=(40,))
     begin = g.step(begin, 0.5, [[1.9], None])
     begin = g.step(g.step(begin, 1.0, [None] * 2), 1.5, [[0.1], None])
     a = f.summarize(late)
@@ -206,7 +208,7 @@ def test_late_reading_is_in_time_after_all(family: str) -> None:
 
 @EACH
 def test_a_run_takes_each_late_reading_when_it_arrives(family: str) -> None:
-    f, start = made(family, sensors=[component([0], std=0.4)], graph=None, lag=2)
+    f, start = make_filter(family, sensors=[component([0], std=0.4)], graph=None, lag=2)
     times = [0.5, 1.0, 1.5, 2.0]
     seen = np.array([[np.nan], [0.3], [np.nan], [0.1]])
     late = [
@@ -223,7 +225,9 @@ def test_a_run_takes_each_late_reading_when_it_arrives(family: str) -> None:
         ]
         state = f.step(state, t, [y], delayed=due)
     assert same(final_state(run), state)
-    with pytest.raises(ValueError, match="delayed must have an arrival_time up to 1.5, got 2.0"):
+    with pytest.raises(
+        ValueError, match="delayed must have an arrival_time up to 1.5, got 2.0"
+    ):
         f.run(start, times[:3], [seen[:3]], delayed=late)
 
 
@@ -260,7 +264,7 @@ def test_a_late_reading_belongs_to_its_own_time(
 
 @EACH
 def test_smoothing_knows_more(family: str) -> None:
-    f, start = made(family, agents=2, lag=4, runs=(30,))
+    f, start = make_filter(family, agents=2, lag=4, runs=(30,))
     truth, seen = data(f.sensors, (30,), seed=4)
     run = f.run(start, TIMES, seen, truth=truth)
     smooth = f.smooth(start, TIMES, seen, truth=truth)
@@ -276,22 +280,24 @@ def test_bad_run_is_named_and_others_go_on(family: str) -> None:
     """A model that leaves the numbers in one run of three at the second step."""
 
     def flow(x: np.ndarray, t: float, dt: float) -> np.ndarray:
-        out = x.copy()
+        moved = x.copy()
         if t > 0.4 and x.ndim > 2 and x.shape[0] == 3:
-            out[1, 0] = np.nan
-        return out
+            moved[1, 0] = np.nan
+        return moved
 
     broken = Model(
         2, flow, lambda t, dt: dt * np.eye(2), derivative=lambda x, t, dt: np.eye(2)
     )
     sensors = [component([0], std=0.5), component([1], std=0.5)]
-    f, start = made(family, sensors=sensors, model=broken, runs=(3,))
+    f, start = make_filter(family, sensors=sensors, model=broken, runs=(3,))
     start = f.step(start, 0.5, [[0.1], [0.2]])
     with pytest.raises(
         FilterError, match=r"run 1, agent 0, t = 1 s: the forecast is not finite"
     ):
         f.step(start, 1.0, [[0.1], [0.2]])
-    g, state = made(family, sensors=sensors, model=broken, runs=(3,), on_error="keep")
+    g, state = make_filter(
+        family, sensors=sensors, model=broken, runs=(3,), on_error="keep"
+    )
     run = g.run(
         state,
         [0.5, 1.0, 1.5],

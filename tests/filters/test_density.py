@@ -62,7 +62,7 @@ def test_complete_graph_and_equal_starts_give_the_centralised_filter(
 
 @pytest.mark.parametrize("name", RULES)
 def test_nobody_reads_beyond_its_links(name: str) -> None:
-    # On a path, moving agent 11 cannot change what agents 0 to 9 believe after one step.
+    # On a path, moving agent 11 cannot change the beliefs of agents 0 to 9 after one step.
     f = make(graphs.path(SIZE), RULES[name])
     moved = PATH[0].copy()
     moved[11] = 1 - moved[11]
@@ -74,12 +74,12 @@ def test_nobody_reads_beyond_its_links(name: str) -> None:
 
 
 def test_coefficients_are_the_whole_density_to_truncation() -> None:
-    whole = last(make(0.5, density.PIConsensus()))
+    full = last(make(0.5, density.PIConsensus()))
     cut = last(make(0.5, density.PIConsensus(modes=100)))
-    assert np.abs(whole.observed - cut.observed).max() < 1e-10
-    assert cut.ledger.scalars.sum() == whole.ledger.scalars.sum()
+    assert np.abs(full.observed - cut.observed).max() < 1e-10
+    assert cut.ledger.scalars.sum() == full.ledger.scalars.sum()
     fewer = last(make(0.5, density.PIConsensus(modes=30)))
-    assert fewer.ledger.scalars.sum() * 101 == whole.ledger.scalars.sum() * 31
+    assert fewer.ledger.scalars.sum() * 101 == full.ledger.scalars.sum() * 31
 
 
 def test_flooding_knows_where_agents_were_as_many_steps_ago_as_hops() -> None:
@@ -101,10 +101,10 @@ def test_flooding_forgets() -> None:
     path = PATH.copy()
     path[2:, 3] = path[:, 4] = np.nan
     all_ = graphs.complete(SIZE)
-    kept = last(make(all_, density.Flooding(), local=(0,)), path)
+    memory = last(make(all_, density.Flooding(), local=(0,)), path)
     gone = last(make(all_, density.Flooding(forget=0.35), local=(0,)), path, t=-9.0)
     assert (
-        kept.positions_sent[0] == SIZE - 1
+        memory.positions_sent[0] == SIZE - 1
         and gone.positions_sent[0] == SIZE - 2
         and gone.positions_sent[4] == 0
     )
@@ -128,8 +128,8 @@ def test_agents_that_go_are_left_out_and_their_filters_go_on() -> None:
         ),
         path,
     )
-    here = [i for i in range(SIZE) if i != 5]
-    want = density.kernel_density(path[-1][here], GRID, bandwidth=H)
+    present = [i for i in range(SIZE) if i != 5]
+    want = density.kernel_density(path[-1][present], GRID, bandwidth=H)
     assert np.abs(state.observed[0] - want).max() < 1e-13
     assert state.parts == 1 and np.isfinite(state.estimates).all()
     assert np.trace(state.filters.information[5]) < np.trace(
@@ -143,7 +143,7 @@ def test_agents_that_go_are_left_out_and_their_filters_go_on() -> None:
 
 
 def test_a_network_that_falls_apart_is_in_the_ledger() -> None:
-    """Nobody hears anything any more: no messages, and each filter goes on with what it has."""
+    """Nobody receives anything any more: no messages, and each filter goes on with its memory."""
 
     def graph(t: float, x: np.ndarray) -> Graph:
         return (
@@ -177,19 +177,19 @@ def test_the_sum_forgets_agents_that_drop_out() -> None:
     for k in range(10):
         state = f.step(state, 0.1 * (k + 1), x)
     x[[2, 7]] = np.nan
-    left = ~np.isnan(x).any(axis=-1)
-    z = density.kernels(x[left], GRID, bandwidth=H)
-    before = (state.carried[0][left, :100] - z).sum(axis=0)
+    remaining = ~np.isnan(x).any(axis=-1)
+    z = density.kernels(x[remaining], GRID, bandwidth=H)
+    before = (state.carried[0][remaining, :100] - z).sum(axis=0)
     for k in range(10, 20):
         state = f.step(state, 0.1 * (k + 1), x)
-    after = (state.carried[0][left, :100] - z).sum(axis=0)
+    after = (state.carried[0][remaining, :100] - z).sum(axis=0)
     assert state.ledger.rounds == 20  # one substep each
-    assert np.abs(before).max() > 0.1  # what the two took with them
+    assert np.abs(before).max() > 0.1  # the part of the two that have left
     assert np.abs(after - (1 - 0.2 * 0.1) ** 10 * before).max() < 1e-12
 
 
 def test_only_the_wanted_estimates_are_made() -> None:
-    """Agents without a filter share as before; what the others learn does not change."""
+    """Agents without a filter share as before; the others' estimates do not change."""
     for rule in RULES.values():
         everyone = last(make(0.5, rule))
         few = last(make(0.5, rule, local=(7, 2)))
@@ -250,8 +250,8 @@ def test_first_estimates() -> None:
     flat = make(0.5, density.Flooding(), initial_std=0.3).start(START)
     gap = ((GRID.centres - START[4]) ** 2).sum(axis=-1)
     assert np.allclose(flat.estimates[4], GRID.normalize(np.exp(-0.5 * gap / 0.09)))
-    own = make(0.5, density.Flooding(), initial_density="observed").start(START)
-    assert np.allclose(own.estimates, density.kernels(START, GRID, bandwidth=H))
+    kernel = make(0.5, density.Flooding(), initial_density="observed").start(START)
+    assert np.allclose(kernel.estimates, density.kernels(START, GRID, bandwidth=H))
     central = make(0.5, density.Centralised(), initial_density="observed").start(START)
     assert np.allclose(
         central.estimates[3], density.kernel_density(START, GRID, bandwidth=H)
@@ -259,14 +259,14 @@ def test_first_estimates() -> None:
 
 
 def test_mass_can_change_where_the_prior_says_so() -> None:
-    """The constant wave's variance is mass_std squared, and R from what is seen leaks mass."""
+    """The constant wave's variance is mass_std², and R from the observed density leaks mass."""
     f = make(0.5, density.Flooding(), mass_std=0.2, noise="observed")
     state = f.start(START)
     P = state.filters.covariance(0) * GRID.volume**2
     assert P.sum() == pytest.approx(0.04, rel=1e-9)
     assert np.abs(GRID.integral(last(f).estimates) - 1).max() > 1e-4
-    kept = last(make(0.5, density.Flooding(), noise="observed"))
-    assert np.abs(GRID.integral(kept.estimates) - 1).max() < 1e-12
+    mass = last(make(0.5, density.Flooding(), noise="observed"))
+    assert np.abs(GRID.integral(mass.estimates) - 1).max() < 1e-12
 
 
 def test_consensus_may_start_flat() -> None:

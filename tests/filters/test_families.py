@@ -1,4 +1,4 @@
-"""What each family promises of its own: exactness, collapse, linearisation, failures of updates."""
+"""Properties of single families: exactness, collapse, linearisation, failures of updates."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from distfilt.network import Faults, covariance_intersection, graphs, mean_pull
 from distfilt.sensors import Sensor, component, from_name
 from distfilt.updates import enkf_exact, enkf_sampled_covariance
 
-from .families import NOISE, PRIOR, TIMES, Q, data, kalman, made, model, team
+from .families import NOISE, PRIOR, TIMES, Q, data, kalman, make_filter, model, team
 
 STILL = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
 BOTH = Sensor(2, lambda x: x, NOISE, linear=lambda d: np.eye(d))
@@ -27,16 +27,16 @@ BOTH = Sensor(2, lambda x: x, NOISE, linear=lambda d: np.eye(d))
 def test_network_of_exact_ensembles_is_the_network_of_kalman_filters(lag: int) -> None:
     """With the same rule of intersection, agent by agent, with loss and a full noise matrix.
 
-    What they agree on tells of the past too; of that moments are exact for a model without noise.
+    The fusion informs the past too, whose moments are exact for a model without noise.
     """
     sensors = team(4)
     _, seen = data(sensors, (3,))
     options = {"graph": graphs.ring(4), "runs": (3,), "sensors": sensors, "lag": lag}
     options |= {"model": replace(model(), noise_cov=lambda t, dt: 0 * Q)} if lag else {}
     faults = Faults(loss=0.3, seed=1)
-    f, start = made("ensemble, exact", faults=faults, **options)
+    f, start = make_filter("ensemble, exact", faults=faults, **options)
     rule = partial(covariance_intersection, rule="min_determinant")
-    g, begin = made("gaussian", fusion=rule, faults=faults, **options)
+    g, begin = make_filter("gaussian", fusion=rule, faults=faults, **options)
     e = start.ensembles
     cov = np.array([[np.cov(m.T) for m in agents] for agents in e])
     state = filters.GaussianState(0.0, begin.ledger, None, e.mean(axis=-2), cov, 2)
@@ -61,12 +61,12 @@ def test_network_of_exact_ensembles_is_the_network_of_kalman_filters(lag: int) -
 def test_gaussian_smoothing_is_the_smoother(rule: str) -> None:
     _, (seen,) = data([BOTH], (4,))
     f = filters.GaussianFilter(model(), [BOTH], linearization=rule, lag=len(TIMES))
-    out = f.smooth(f.start(PRIOR, runs=(4,)), TIMES, [seen])
+    smoothed = f.smooth(f.start(PRIOR, runs=(4,)), TIMES, [seen])
     filtered, moves = kalman([seen], [BOTH])
     exact = rts_smoother(filtered, **moves)
-    assert np.allclose(out["mean"].values[..., 0, :], exact.means, atol=1e-11)
+    assert np.allclose(smoothed["mean"].values[..., 0, :], exact.means, atol=1e-11)
     assert np.allclose(
-        out["covariance"].values[..., 0, :, :], exact.covariances, atol=1e-11
+        smoothed["covariance"].values[..., 0, :, :], exact.covariances, atol=1e-11
     )
 
 
@@ -132,32 +132,32 @@ def test_a_member_that_was_picked_or_moved_sees_changes_from_where_it_comes() ->
     assert (state.particles[0] == state.particles[1]).all() and (
         after.particles[0] != after.particles[1]
     ).any()
-    kept = replace(f, ess_threshold=0.2).step(state, 2.0, [None] * 2)
-    assert (kept.particles == state.particles).all() and (
-        kept.weights == state.weights
+    lagged = replace(f, ess_threshold=0.2).step(state, 2.0, [None] * 2)
+    assert (lagged.particles == state.particles).all() and (
+        lagged.weights == state.weights
     ).all()
-    some = f.step(start, 1.0, [first, None])
+    subset = f.step(start, 1.0, [first, None])
     few = replace(f, ess_threshold=0.9)
-    again = [
-        few.step(some, 2.0, [None] * 2).particles for _ in range(2)
+    repeated = [
+        few.step(subset, 2.0, [None] * 2).particles for _ in range(2)
     ]  # a state stays as it was
-    assert (again[0] == again[1]).all()
-    assert (again[0] != start.particles).any(axis=(1, 2)).tolist() == [True, False]
+    assert (repeated[0] == repeated[1]).all()
+    assert (repeated[0] != start.particles).any(axis=(1, 2)).tolist() == [True, False]
     g = filters.EnsembleFilter(STILL, eyes, members=50, lag=1)
     state = g.step(g.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [None])
-    told, not_told = (
+    delayed, not_told = (
         g.step(state, 2.0, [y], delayed=[first]).ensembles for y in ([still], None)
     )
-    assert np.allclose(told, not_told)
+    assert np.allclose(delayed, not_told)
 
 
 @pytest.mark.parametrize("family", ["ensemble", "particle", "ensemble, common"])
 def test_a_change_that_is_read_after_its_step_is_one_from_the_step_s_begin(
     family: str,
 ) -> None:
-    """A reading moves members as in one step with it; of what is not kept it is refused."""
+    """A delayed observation acts as in its own step; one of a time that is not kept is refused."""
     eyes = [[from_name("increment", [0], std=0.5), component([1], std=0.8)]]
-    f, start = made(family, sensors=eyes, graph=None, lag=2)
+    f, start = make_filter(family, sensors=eyes, graph=None, lag=2)
     now = [[filters.Observation(1.0, 0, [0.4]), filters.Observation(1.0, 0, [-0.7], 1)]]
     moved = f.step(start, 0.5, [None])
     at_once = [replace(f, lag=k).step(moved, 1.0, now) for k in range(3)]
@@ -213,7 +213,7 @@ def test_copies_are_regularised_by_default_where_the_model_never_parts_them() ->
 def test_one_weight_for_all_warns_although_the_particles_are_distinct(
     jitter: float,
 ) -> None:
-    """Its copies are moved apart by a share of what the cloud was, or nothing parts them."""
+    """Jitter of the former spread separates its copies; otherwise they stay equal."""
     f = filters.ParticleFilter(
         STILL, [component([0], std=1e-4)], members=800, jitter=jitter
     )
@@ -224,10 +224,10 @@ def test_one_weight_for_all_warns_although_the_particles_are_distinct(
         state = f.step(start, 1.0, [[0.5]])
     summary = f.summarize(state)
     assert summary.numbers["distinct"] == 1.0 and summary.numbers["effective_size"] < 2
-    told = pytest.warns(
+    caught = pytest.warns(
         filters.ParticleCollapse, match=r"t = 2 s: 0\.\d+% of an agent's particles"
     )
-    with nullcontext() if jitter else told:
+    with nullcontext() if jitter else caught:
         after = f.step(state, 2.0, [None])
     assert np.allclose(
         after.particles.std(), jitter * state.particles.std(), rtol=0.1, atol=1e-4
@@ -285,14 +285,14 @@ def test_a_run_whose_covariance_overflows_leaves_the_others_to_agree() -> None:
 
 
 def test_an_agreement_for_one_run_is_asked_for_each() -> None:
-    """With the losses of the same rule for all; what they lose on average is in the account."""
+    """They lose the same messages as with the rule for all; the ledger has their mean."""
 
     def one(ensembles: np.ndarray, channel: Any) -> np.ndarray:
         if channel.runs:
             raise ValueError("channel must be a single run")
         return mean_pull(ensembles, channel, gain=0.3)
 
-    f, start = made(
+    f, start = make_filter(
         "ensemble",
         fusion=partial(mean_pull, gain=0.3),
         runs=(2, 3),
@@ -309,10 +309,10 @@ def test_a_run_whose_agreement_fails_leaves_the_others_as_they_are() -> None:
     """With losses of their own, and charged as if all had gone well."""
 
     def fragile(ensembles: np.ndarray, channel: Any) -> np.ndarray:
-        out = mean_pull(ensembles, channel, gain=0.3)
-        if (out > 50).any():
+        result = mean_pull(ensembles, channel, gain=0.3)
+        if (result > 50).any():
             raise np.linalg.LinAlgError("it is far off")
-        return out
+        return result
 
     f = filters.EnsembleFilter(
         model(),
@@ -379,10 +379,10 @@ def test_a_run_whose_update_fails_is_named_and_leaves_the_others_their_draws(
     )
     start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(3,))
     good = f.step(start, 0.5, [np.zeros((3, 1))] * 2)
-    some = f.step(start, 0.5, [np.zeros((3, 1)), np.array([[0.0], [9.0], [0.0]])])
-    assert some.failed.tolist() == [False, True, False]
-    np.testing.assert_array_equal(some.ensembles[[0, 2]], good.ensembles[[0, 2]])
-    assert np.isnan(f.summarize(some).mean[1]).all()
+    failing = f.step(start, 0.5, [np.zeros((3, 1)), np.array([[0.0], [9.0], [0.0]])])
+    assert failing.failed.tolist() == [False, True, False]
+    np.testing.assert_array_equal(failing.ensembles[[0, 2]], good.ensembles[[0, 2]])
+    assert np.isnan(f.summarize(failing).mean[1]).all()
     strict = replace(f, on_error="raise")
     with pytest.raises(
         filters.FilterError, match="run 1, agent 1, t = 0.5 s: .*ite"

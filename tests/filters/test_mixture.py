@@ -41,7 +41,7 @@ def test_splitting_improves_a_bent_forecast() -> None:
 
 
 def test_only_the_target_marginal_is_heard() -> None:
-    # What agent 2 believes of itself, and how that goes with the target, changes nothing for 1.
+    # Agent 2's belief about itself, and its correlation with the target, change nothing for 1.
     odd = GaussianMixture.gaussian([1.2, 77.0], [[1.0, -0.9], [-0.9, 5.0]])
     a, b = (TWO.step(TWO.start([OTHER, m]), 1.0, [[1.0], None]) for m in (OTHER, odd))
     assert a.ledger.scalars.tolist() == [3, 3]

@@ -15,7 +15,7 @@ from distfilt.network import Ledger
 
 
 @dataclass(frozen=True, eq=False)
-class Kept(State):
+class EveryField(State):
     """A family of one's own with every kind of field."""
 
     size: int
@@ -26,11 +26,11 @@ class Kept(State):
     counts: np.ndarray
 
 
-def kept(rng: np.random.Generator | None) -> Kept:
+def make_state(rng: np.random.Generator | None) -> EveryField:
     sent = np.array([3, 4])
     ledger = Ledger(1, sent, 5 * sent, 40 * sent, np.array([0.5, 0.0]))
     nested = ((0.1, np.arange(3.0)), (0.2, np.array([np.nan, np.inf, -0.0])))
-    return Kept(
+    return EveryField(
         1.5, ledger, rng, 7, "a b", nested, None, True, np.array([1, 2], dtype=np.int32)
     )
 
@@ -40,11 +40,11 @@ def test_everything_comes_back(tmp_path: Path, kind: str) -> None:
     rng = np.random.Generator(getattr(np.random, kind)([1, 2**40]))
     rng.spawn(2)
     rng.random(5)
-    before = kept(rng)
+    before = make_state(rng)
     before.save(tmp_path / "a.npz")
-    after = Kept.load(tmp_path / "a.npz")
-    got = (after.t, after.size, after.word, after.nothing, after.yes)
-    assert got == (1.5, 7, "a b", None, True)
+    after = EveryField.load(tmp_path / "a.npz")
+    loaded = (after.t, after.size, after.word, after.nothing, after.yes)
+    assert loaded == (1.5, 7, "a b", None, True)
     assert after.counts.dtype == np.int32 and after.counts.tolist() == [1, 2]
     assert [t for t, _ in after.nested] == [0.1, 0.2]
     for (_, a), (_, b) in zip(before.nested, after.nested, strict=True):
@@ -59,7 +59,7 @@ def test_a_failed_save_leaves_the_earlier_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.npz"
-    kept(None).save(path)
+    make_state(None).save(path)
     before = path.read_bytes()
 
     def full(*args: object, **options: object) -> None:
@@ -67,7 +67,7 @@ def test_a_failed_save_leaves_the_earlier_file(
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match=r"no space left: .*a\.npz"):
-        kept(np.random.default_rng(0)).save(path)
+        make_state(np.random.default_rng(0)).save(path)
     assert path.read_bytes() == before and os.listdir(tmp_path) == ["a.npz"]
 
 
@@ -87,18 +87,18 @@ def test_a_twin_with_the_same_fields_is_another_kind(tmp_path: Path) -> None:
 def test_damage_is_found_at_every_byte(tmp_path: Path) -> None:
     """Neither a flipped bit nor a cut gives a state: the file is refused by name."""
     path = tmp_path / "a.npz"
-    kept(np.random.default_rng(3)).save(path)
-    whole = path.read_bytes()
+    make_state(np.random.default_rng(3)).save(path)
+    content = path.read_bytes()
     rng = np.random.default_rng(0)
-    for place in rng.choice(len(whole), 400, replace=False):
-        bad = bytearray(whole)
+    for place in rng.choice(len(content), 400, replace=False):
+        bad = bytearray(content)
         bad[place] ^= 1 << int(rng.integers(8))
         path.write_bytes(bad)
         with pytest.raises(ValueError, match="path must .*a.npz: it is damaged"):
-            Kept.load(path)
-    for size in (0, 10, len(whole) // 2, len(whole) - 1):
-        path.write_bytes(whole[:size])
+            EveryField.load(path)
+    for size in (0, 10, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:size])
         with pytest.raises(ValueError, match="path"):
-            Kept.load(path)
+            EveryField.load(path)
     with pytest.raises(FileNotFoundError):
-        Kept.load(tmp_path / "none.npz")
+        EveryField.load(tmp_path / "none.npz")

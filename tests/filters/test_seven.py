@@ -53,16 +53,20 @@ EACH = pytest.mark.parametrize("family", [*SIX, "density"])
 OF_SIX = pytest.mark.parametrize("family", SIX)
 
 
-def made(family: str, times: Any = TIMES, **options: Any) -> tuple[Any, Any, Any, Any]:
+def make_filter(
+    family: str, times: Any = TIMES, **options: Any
+) -> tuple[Any, Any, Any, Any]:
     """A filter, its first state, the readings agent by agent, and the truth."""
     if family == "density":
         path = SWARM.simulate(PLACES, times, rng=np.random.default_rng(2), substeps=2)
-        given = {"fusion": Flooding(), "bandwidth": 0.15, "rank": 20} | options
-        f: Any = filters.DensityFilter(LAW, 9, given.pop("graph", 0.5), **given)
+        arguments = {"fusion": Flooding(), "bandwidth": 0.15, "rank": 20} | options
+        f: Any = filters.DensityFilter(LAW, 9, arguments.pop("graph", 0.5), **arguments)
         return f, f.start(PLACES), path.swapaxes(0, 1), LAW.evolve(np.ones(81), times)
     truth, seen = data(options.get("sensors", EYES))
-    given = {"graph": NET, "sensors": EYES} | options
-    f = SIX[family](model(), given.pop("sensors"), given.pop("graph"), **given)
+    arguments = {"graph": NET, "sensors": EYES} | options
+    f = SIX[family](
+        model(), arguments.pop("sensors"), arguments.pop("graph"), **arguments
+    )
     seen = [None if s is None else s[: len(times)] for s in seen]
     return f, f.start(PRIOR, rng=np.random.default_rng(0)), seen, truth[: len(times)]
 
@@ -76,24 +80,26 @@ def test_a_run_is_its_steps_whether_saved_or_not(family: str, tmp_path: Path) ->
     )
     if family in ("ensemble", "gaussian", "particle"):
         options["lag"] = 1
-    f, start, seen, truth = made(family, times, **options)
+    f, start, seen, truth = make_filter(family, times, **options)
     run = f.run(start, times, seen, truth=truth)
     state = start
     for k, t in enumerate(times):
         state = f.step(state, t, [s[k] for s in seen])
         state.save(tmp_path / "state.npz")
         state = type(state).load(tmp_path / "state.npz")
-        if t < times[-1]:  # what is recorded of several states is that of each
-            rest = f.run(
+        if t < times[-1]:  # a record of several states at once has each one's numbers
+            remainder = f.run(
                 state, times[k + 1 :], [s[k + 1 :] for s in seen], truth=truth[k + 1 :]
             )
             xarray.testing.assert_allclose(
-                rest, run.isel(time=slice(k + 1, None)), 1e-9, 1e-12
+                remainder, run.isel(time=slice(k + 1, None)), 1e-9, 1e-12
             )
-            xarray.testing.assert_equal(rest["mean"], run["mean"][k + 1 :])
-        again = f.summarize(state)
-        assert np.array_equal(run["mean"].values[k], again.mean, equal_nan=True)
-        assert np.array_equal(run["variance"].values[k], again.variance, equal_nan=True)
+            xarray.testing.assert_equal(remainder["mean"], run["mean"][k + 1 :])
+        repeated = f.summarize(state)
+        assert np.array_equal(run["mean"].values[k], repeated.mean, equal_nan=True)
+        assert np.array_equal(
+            run["variance"].values[k], repeated.variance, equal_nan=True
+        )
         for name in ("rounds", "messages", "scalars", "bytes", "lost"):
             total = run[f"{name}_total"].values
             assert np.array_equal(total[k], getattr(state.ledger, name))
@@ -106,7 +112,7 @@ def test_a_run_is_its_steps_whether_saved_or_not(family: str, tmp_path: Path) ->
 
 @OF_SIX
 def test_events_of_any_order_are_the_series(family: str) -> None:
-    f, start, seen, _ = made(family)
+    f, start, seen, _ = make_filter(family)
     pairs = [
         (a, *pair) for a, s in enumerate(seen) for pair in zip(TIMES, s, strict=True)
     ]
@@ -119,8 +125,8 @@ def test_events_of_any_order_are_the_series(family: str) -> None:
         a, f.run(start, TIMES, [pandas.DataFrame(s) for s in seen])
     )
     gaps = [[None, *s[1:]] for s in seen]
-    some = [np.concatenate([s[:1] * np.nan, s[1:]]) for s in seen]
-    xarray.testing.assert_equal(f.run(start, TIMES, gaps), f.run(start, TIMES, some))
+    subset = [np.concatenate([s[:1] * np.nan, s[1:]]) for s in seen]
+    xarray.testing.assert_equal(f.run(start, TIMES, gaps), f.run(start, TIMES, subset))
     more = f.run(start, [0.05, TIMES[-1] + 1], mixed)
     assert more["time"].size == len(TIMES) + 2
     assert (
@@ -131,13 +137,13 @@ def test_events_of_any_order_are_the_series(family: str) -> None:
 
 @pytest.mark.parametrize("options", [{}, {"fusion": partial(mean_pull, gain=0.0)}])
 def test_particles_that_hear_all_are_the_joint_filter(options: Any) -> None:
-    """Up to what their number leaves to chance; agreed of or not."""
-    f, start, seen, _ = made("particle", **options)
+    """Up to the sampling error of their number, with and without a fusion."""
+    f, start, seen, _ = make_filter("particle", **options)
     exact, _ = kalman(seen, EYES)
     for k, state in enumerate(f.steps(start, TIMES, seen)):
-        found = f.summarize(state)
-        assert np.abs(found.mean - exact.means[k]).max() < 0.3
-        assert np.abs(found.covariance - exact.covariances[k]).max() < 0.3
+        result = f.summarize(state)
+        assert np.abs(result.mean - exact.means[k]).max() < 0.3
+        assert np.abs(result.covariance - exact.covariances[k]).max() < 0.3
 
 
 @OF_SIX
@@ -152,7 +158,7 @@ def test_units_change_nothing(family: str) -> None:
         component([1], std=0.5 * big),
         component([0], std=0.3 * big),
     ]
-    f, start, seen, _ = made(
+    f, start, seen, _ = make_filter(
         family,
         sensors=[
             component([0], std=0.6),
@@ -172,7 +178,7 @@ def test_units_change_nothing(family: str) -> None:
 
 @pytest.mark.parametrize("family", ["gaussian", "mixture", "news", "density"])
 def test_the_order_of_agents_changes_nothing(family: str) -> None:
-    f, start, seen, _ = made(family)
+    f, start, seen, _ = make_filter(family)
     order = np.random.default_rng(4).permutation(len(seen))
     if family == "density":
         g = f
@@ -189,7 +195,7 @@ def test_the_order_of_agents_changes_nothing(family: str) -> None:
 @pytest.mark.parametrize("family", SIX)
 def test_the_gate_lets_pass_what_its_share_says(family: str) -> None:
     """Just inside the quantile a reading counts, just outside it is left out and counted."""
-    f, start, _, _ = made(
+    f, start, _, _ = make_filter(
         family, sensors=[component([0, 1], std=0.6), None, None], gate_probability=0.95
     )
     start = f.step(
@@ -209,13 +215,13 @@ def test_the_gate_lets_pass_what_its_share_says(family: str) -> None:
             same = np.allclose(f.summarize(after).mean[0], blind.mean[0], atol=1e-12)
             assert same == bool(refused)
     # Straight behind a direction predictions lie on both sides of where its residuals jump.
-    given = {
+    arguments = {
         "sensors": [bearing([0, 1], std=0.05), None, None],
         "gate_probability": 0.99,
     }
-    f = made(
+    f = make_filter(
         family,
-        **given | ({"linearization": "unscented"} if family == "gaussian" else {}),
+        **arguments | ({"linearization": "unscented"} if family == "gaussian" else {}),
     )[0]
     start = f.start(
         (np.array([9.0, 0.0]), 0.2 * np.eye(2)), rng=np.random.default_rng(0)
@@ -225,8 +231,8 @@ def test_the_gate_lets_pass_what_its_share_says(family: str) -> None:
 
 def test_each_reading_is_judged_alone() -> None:
     """Of two readings that an agent has, its own and a neighbour's, only the wild one goes."""
-    f, start, _, _ = made("gaussian", gate_probability=0.999)
-    plain = made("gaussian")[0]
+    f, start, _, _ = make_filter("gaussian", gate_probability=0.999)
+    plain = make_filter("gaussian")[0]
     good = [0.9]
     wild = [0.8, 40.0]
     a = f.step(start, 0.1, [good, wild, None])
@@ -234,7 +240,7 @@ def test_each_reading_is_judged_alone() -> None:
     assert a.rejected.tolist() == [1, 1, 1] and np.array_equal(a.means, b.means)
     run = f.run(start, [0.1], [[good], [wild], None])
     assert run["rejected"].values.tolist() == [[1, 1, 1]]
-    f, start, _, _ = made("gaussian", gate_probability=0.999, lag=1)
+    f, start, _, _ = make_filter("gaussian", gate_probability=0.999, lag=1)
     blind = f.step(start, 0.1, [None] * 3)
     late = filters.Observation(0.1, 0, [40.0])
     assert f.step(blind, 0.4, [None, wild, None], delayed=[late]).rejected.tolist() == [
@@ -263,28 +269,30 @@ def test_each_reading_is_judged_alone() -> None:
 @pytest.mark.parametrize("t0", [0.0, 1.7e9])
 @pytest.mark.parametrize("family", ["gaussian", "news"])
 def test_nothing_is_lost_until_the_next_contact(family: str, t0: float) -> None:
-    """After it everybody knows what one filter with all readings knows; before, only its own."""
+    """After it everybody has the belief of one filter of all observations; before, its own."""
     quiet = LinearModel.from_transition(
         2, model().transition_matrix, lambda t, dt: 0 * Q
     )
     lag = {"lag": 8} if family == "gaussian" else {}
     f = SIX[family](quiet, EYES, NET, exchange_interval=0.2, **lag)
     g = filters.GaussianFilter(quiet, EYES, NET)
-    own = filters.GaussianFilter(quiet, EYES, NET, share_observations=False)
+    private = filters.GaussianFilter(quiet, EYES, NET, share_observations=False)
     seen = [s[:5] for s in data(EYES)[1]]
     # Multiples of .2 lie in the third step and, rounded, in the fourth, which is once.
     times = t0 + np.array([0.1, 0.15, 0.5, 0.6, 0.65])
-    told = [2, 3]
-    walks = (h.steps(h.start(PRIOR, t=t0), times, seen) for h in (f, g, own))
-    states, everything, alone = map(list, walks)
+    contacts = [2, 3]
+    walks = (h.steps(h.start(PRIOR, t=t0), times, seen) for h in (f, g, private))
+    states, everything, single = map(list, walks)
     for k in range(5):
         spoke = states[k].ledger.rounds - (states[k - 1].ledger.rounds if k else 0)
-        assert spoke == (k in told)
-        wanted = everything[k] if k in told else alone[k] if k < told[0] else None
+        assert spoke == (k in contacts)
+        wanted = (
+            everything[k] if k in contacts else single[k] if k < contacts[0] else None
+        )
         if wanted is not None:
-            found = f.summarize(states[k])
-            assert np.allclose(found.mean, wanted.means, atol=1e-9)
-            assert np.allclose(found.covariance, wanted.covariances, atol=1e-9)
+            result = f.summarize(states[k])
+            assert np.allclose(result.mean, wanted.means, atol=1e-9)
+            assert np.allclose(result.covariance, wanted.covariances, atol=1e-9)
 
 
 def test_what_was_heard_is_not_told_as_one_s_own() -> None:
@@ -297,48 +305,50 @@ def test_what_was_heard_is_not_told_as_one_s_own() -> None:
     f = filters.InformationIncrementFilter(
         quiet, EYES, lambda t: NET if t > 0.95 else one_way, target_dim=2
     )
-    found, wanted = (
+    result, expected = (
         h.run(h.start(PRIOR), TIMES[:4], [s[:4] for s in seen])["covariance"][-1, :2]
         for h in (f, filters.GaussianFilter(quiet, EYES, NET))
     )
-    assert np.allclose(found, wanted, atol=1e-9)
+    assert np.allclose(result, expected, atol=1e-9)
 
 
 def test_what_waits_survives_on_disk_and_a_lag_has_to_reach_it(tmp_path: Path) -> None:
-    f, start, seen, _ = made("gaussian", exchange_interval=1.0, lag=8)
+    f, start, seen, _ = make_filter("gaussian", exchange_interval=1.0, lag=8)
     states = list(f.steps(start, TIMES, seen))
     assert states[0].pending and not states[3].pending
     states[1].save(tmp_path / "s.npz")
     for s in seen:
-        s[:2] = 9.0  # a buffer that is filled again is not what waits
-    for again in (states[1], type(start).load(tmp_path / "s.npz")):
+        s[:2] = 9.0  # a buffer that is filled again does not change the pending values
+    for resumed in (states[1], type(start).load(tmp_path / "s.npz")):
         for k in (2, 3):
-            again = f.step(again, TIMES[k], [s[k] for s in seen])
-        assert np.array_equal(again.joint_means, states[3].joint_means)
-    short, start, seen, _ = made("gaussian", exchange_interval=1.0, lag=1)
+            resumed = f.step(resumed, TIMES[k], [s[k] for s in seen])
+        assert np.array_equal(resumed.joint_means, states[3].joint_means)
+    short, start, seen, _ = make_filter("gaussian", exchange_interval=1.0, lag=1)
     with pytest.raises(
         ValueError, match="lag must be at least 1 for observations that wait"
     ):
-        made("gaussian", exchange_interval=1.0)
+        make_filter("gaussian", exchange_interval=1.0)
     with pytest.raises(ValueError, match="lag must reach back to t = 0"):
         short.run(start, TIMES, seen)
 
 
 @EACH
 def test_truth_of_each_agent_and_of_named_components(family: str) -> None:
-    f, start, seen, truth = made(family)
-    alike = f.run(start, TIMES, seen, truth=truth)
+    f, start, seen, truth = make_filter(family)
+    common = f.run(start, TIMES, seen, truth=truth)
     each = np.repeat(truth[:, None], len(seen), axis=1)
-    xarray.testing.assert_equal(alike, f.run(start, TIMES, seen, truth=each))
+    xarray.testing.assert_equal(common, f.run(start, TIMES, seen, truth=each))
     table = pandas.DataFrame(truth, columns=f.components[0]).iloc[:, ::-1]
-    xarray.testing.assert_allclose(alike, f.run(start, TIMES, seen, truth=table))
+    xarray.testing.assert_allclose(common, f.run(start, TIMES, seen, truth=table))
     name = f.components[0][1]
-    some = f.run(start, TIMES, seen, truth={name: truth[:, 1]})
-    one = some["squared_error"].sel(component=name)
-    assert np.array_equal(one, alike["squared_error"].sel(component=name))
-    assert some["squared_error"].isel(component=0).isnull().all()
-    if "nees" in some and "covariance" in some:
-        assert np.allclose(some["nees"], one / some["variance"].sel(component=name))
+    partial_truth = f.run(start, TIMES, seen, truth={name: truth[:, 1]})
+    one = partial_truth["squared_error"].sel(component=name)
+    assert np.array_equal(one, common["squared_error"].sel(component=name))
+    assert partial_truth["squared_error"].isel(component=0).isnull().all()
+    if "nees" in partial_truth and "covariance" in partial_truth:
+        assert np.allclose(
+            partial_truth["nees"], one / partial_truth["variance"].sel(component=name)
+        )
     for wrong, text in (
         ({"speed": truth[:, 1]}, "have components"),
         (truth[:, :1], "be .*or a dict of"),
@@ -349,7 +359,7 @@ def test_truth_of_each_agent_and_of_named_components(family: str) -> None:
 
 @EACH
 def test_a_selection_has_no_wrong_state(family: str) -> None:
-    f, start, seen, _ = made(family)
+    f, start, seen, _ = make_filter(family)
     run = f.run(start, TIMES, seen)
     last = final_state(run)
     assert last.t == TIMES[-1]
@@ -369,10 +379,10 @@ def test_a_selection_has_no_wrong_state(family: str) -> None:
 
 
 def test_a_state_and_a_reading_of_another_are_refused() -> None:
-    f, start, seen, _ = made("gaussian")
+    f, start, seen, _ = make_filter("gaussian")
     with pytest.raises(ValueError, match="state must be a GaussianState"):
-        f.step(made("particle")[1], 0.1, seen)
-    g, other, _, _ = made("ensemble")
+        f.step(make_filter("particle")[1], 0.1, seen)
+    g, other, _, _ = make_filter("ensemble")
     with pytest.raises(ValueError, match="state must have sizes"):
         g.step(
             filters.EnsembleFilter(model(), EYES, NET, members=7).start(
@@ -392,7 +402,7 @@ def test_a_state_and_a_reading_of_another_are_refused() -> None:
 
 
 def test_a_prior_of_any_kind() -> None:
-    f, _, _, _ = made("gaussian")
+    f, _, _, _ = make_filter("gaussian")
     frozen = multivariate_normal(*PRIOR)
     mixture = GaussianMixture.gaussian(*PRIOR)
     members = frozen.rvs(size=50, random_state=np.random.default_rng(0))
@@ -408,7 +418,7 @@ def test_a_prior_of_any_kind() -> None:
         (f, lambda n, rng, leading: None, "got a function"),
         (f, ([0.0, 0.0], [1.0, 1.0]), r"have a covariance of .*, got \(2,\)"),
         (unscented, flat, "definite"),
-        (made("mixture")[0], flat, "definite"),
+        (make_filter("mixture")[0], flat, "definite"),
     ):
         with pytest.raises(ValueError, match=f"prior must .*{text}"):
             g.start(wrong)
@@ -467,7 +477,7 @@ def test_inflation_widens_the_forecast_and_goes_with_fusion_and_the_past() -> No
     )
     c = f.step(f.start(PRIOR), 0.5, [None] * 3)
     assert np.allclose(c.covariances, a.covariances)
-    # What is agreed of now tells of the past as much as its regression on now says.
+    # The past follows the fused present by its regression on it: m + G Δm and P + G ΔP Gᵀ.
     c, b = (
         f.step(f.start(PRIOR), 0.5, [[0.3], [0.2, 0.4], [0.9]])
         for f in (
@@ -478,13 +488,13 @@ def test_inflation_widens_the_forecast_and_goes_with_fusion_and_the_past() -> No
         )
     )
     p = c.joint_covariances
-    alone = b.joint_covariances
-    gap = c.joint_means - b.joint_means
+    unfused = b.joint_covariances
+    shift = c.joint_means - b.joint_means
     fused = covariance_intersection((b.means, b.covariances), Channel(NET))
-    gain = alone[..., 2:, :2] @ np.linalg.inv(alone[..., :2, :2])
+    gain = unfused[..., 2:, :2] @ np.linalg.inv(unfused[..., :2, :2])
     assert np.allclose(p[..., 2:, :2], gain @ p[..., :2, :2])
     assert np.allclose(
-        (p - alone)[..., 2:, 2:], gain @ (p - alone)[..., :2, :2] @ gain.mT
+        (p - unfused)[..., 2:, 2:], gain @ (p - unfused)[..., :2, :2] @ gain.mT
     )
-    assert np.allclose(gap[..., 2:, None], gain @ gap[..., :2, None])
+    assert np.allclose(shift[..., 2:, None], gain @ shift[..., :2, None])
     assert np.allclose(c.means, fused[0]) and np.allclose(c.covariances, fused[1])

@@ -39,17 +39,17 @@ def _start(f: TransportFilter, runs: tuple[int, ...] = ()) -> EnsembleState:
 
 
 def _central(state: EnsembleState, seen: list[Any], steps: int) -> np.ndarray:
-    """One agent with all sensors, written out; it draws what every agent draws."""
+    """One agent with all sensors, written out; it draws the agents' common numbers."""
     x = state.ensembles[0]
     rng = state.rng
     t = state.t
     assert rng is not None
-    whole = stack([s for s in FOUR if s is not None])
-    weight = np.linalg.inv(whole.noise_cov)
+    stacked = stack([s for s in FOUR if s is not None])
+    weight = np.linalg.inv(stacked.noise_cov)
     for k in range(steps):
         x = model().sample_step(x, t, TIMES[k] - t, rng=rng)
         t = TIMES[k]
-        gap = np.concatenate([o[k] for o in seen]) - whole.predict(x, None)
+        gap = np.concatenate([o[k] for o in seen]) - stacked.predict(x, None)
         x = transform_ensemble(x, -0.5 * np.einsum("ni,ij,nj->n", gap, weight, gap))
     return x
 
@@ -82,11 +82,11 @@ def test_only_log_likelihoods_are_sent() -> None:
 def test_an_agent_whom_nobody_hears_counts_its_own_reading_once() -> None:
     f = _filter(graph=Graph.from_edges(4, []))
     y = [[0.3], [1.0], [0.5, 0.2], [-0.4]]
-    apart = f.step(_start(f), 0.5, y).ensembles
+    separate = f.step(_start(f), 0.5, y).ensembles
     for k in range(4):
         one = _filter(sensors=FOUR[k : k + 1], graph=None)
-        alone = one.step(_start(one), 0.5, [y[k]]).ensembles[0]
-        assert np.allclose(alone, apart[k], atol=1e-13)
+        single = one.step(_start(one), 0.5, [y[k]]).ensembles[0]
+        assert np.allclose(single, separate[k], atol=1e-13)
     f = _filter(graph=lambda t: graphs.ring(4) if t > 0.7 else Graph.from_edges(4, []))
     for now, late in ((y, []), ([None] * 4, [Observation(0.5, 0, [0.3])])):
         with pytest.raises(
@@ -147,9 +147,9 @@ def test_weights_of_a_run_that_failed_are_no_collapse(
 def test_a_step_without_any_reading_moves_nothing() -> None:
     f = _filter(rejuvenation=0.3)
     state = _start(f)
-    out = f.step(state, 0.5, [None] * 4)
+    after = f.step(state, 0.5, [None] * 4)
     rng = _start(f).rng
     assert rng is not None
     assert (
-        out.ensembles[0] == model().sample_step(state.ensembles[0], 0.0, 0.5, rng=rng)
+        after.ensembles[0] == model().sample_step(state.ensembles[0], 0.0, 0.5, rng=rng)
     ).all()

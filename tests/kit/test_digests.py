@@ -26,6 +26,7 @@ def test_digest_survives_rounding(values, seed):
     curve = np.array(values)
     noise = np.random.default_rng(seed).uniform(-1, 1, curve.size)
     assert digest(curve=curve * (1 + 1e-9 * noise)) == digest(curve=curve)
+    # Errors of the last bit of the largest entry, as other processors make
     assert digest(curve=curve + 1e-16 * np.abs(curve).max() * noise) == digest(
         curve=curve
     )
@@ -35,6 +36,7 @@ def test_digest_survives_rounding(values, seed):
     "value", [1.0, 10.0, 1e-3, 0.12345, 12.345, 1.0005, 9.9995, -2.5e7, 1e-9]
 )
 def test_digest_is_steady_at_round_numbers(value):
+    # A tie of the rounding at a round number would make the digits unstable.
     curve = np.array([value, 0.3 * value, -0.7 * value, 1.0])
     texts = {digest(c=curve * (1 + e)) for e in (0.0, 1e-9, -1e-9, 1e-13, -1e-13)}
     assert len(texts) == 1
@@ -79,6 +81,7 @@ def test_digest_text():
 def test_digest_is_the_documented_projection():
     values = np.array([3.0, -1.0, 4.0, 1.5])
     k = np.arange(4)
+    # The formula of the docstring, written once more
     weights = np.array([1, -1, 1, -1]) * (1 + (k * (np.sqrt(5) - 1) / 2) % 1)
     expected = weights @ values / np.linalg.norm(weights)
     printed = float(digest(a=values).rsplit(" ", 1)[1])
@@ -140,6 +143,7 @@ CHANGED = [
 
 
 def test_one_changed_artist_changes_the_text():
+    # Every changed artist must give a text of its own.
     changes = ["", *CHANGED, "swapped panels", "hidden curve", "missing points"]
     texts = [of_axes(picture(change)) for change in changes]
     assert len(set(texts)) == len(changes) and texts[0] == of_axes(picture())
@@ -148,6 +152,7 @@ def test_one_changed_artist_changes_the_text():
 def test_drawing_and_style_do_not_change_the_text(tmp_path):
     figure = picture()
     before = of_axes(figure)
+    # Drawing computes layouts; the data stay the same.
     figure.savefig(tmp_path / "a.png", dpi=40)
     assert of_axes(figure) == before
     for axes in figure.axes:

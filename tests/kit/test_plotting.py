@@ -80,6 +80,7 @@ def test_ellipse_holds_its_share():
     mean = np.array([3.0, -2.0])
     ax = plotting.ellipse(blank(), mean, cov, level=0.8, index=1, label="A")
     outline = ax.lines[0].get_xydata() - mean
+    # All points of the outline have the Mahalanobis distance of the level.
     squared = (outline * np.linalg.solve(cov, outline.T).T).sum(axis=1)
     assert np.allclose(squared, -2 * np.log(0.2), rtol=1e-10)
     assert ax.lines[0].get_color() == PALETTE[1] and ax.lines[0].get_label() == "A"
@@ -95,6 +96,7 @@ def test_band_shows_median_and_quantiles():
     ax = plotting.band(
         blank(), np.arange(7), runs, quantiles=(0.05, 0.95), index=2, label="runs"
     )
+    # With 101 runs, the quantiles 0.05, 0.5 and 0.95 are the runs 5, 50 and 95.
     ordered = np.sort(runs, axis=0)
     assert np.allclose(ax.lines[0].get_ydata(), ordered[50])
     edges = ax.collections[0].get_paths()[0].vertices[:, 1]
@@ -106,6 +108,7 @@ def test_band_shows_median_and_quantiles():
 def test_graph_draws_links_once():
     adjacency = np.array([[1, 1, 1], [1, 0, 0], [1, 0, 1]])
     ax = graph(blank(), adjacency, labels=["A", "B", "C"])
+    # Each link once, and no link of an agent to itself
     ends = {tuple(map(tuple, line.get_xydata().round(6))) for line in ax.lines}
     discs = [tuple(p) for p in ax.collections[0].get_offsets().round(6).tolist()]
     assert ends == {(discs[0], discs[1]), (discs[0], discs[2])}
@@ -117,6 +120,7 @@ def test_graph_draws_links_once():
 
 def test_graph_fills_discs_and_writes_notes():
     ax = graph(blank(), PAIR, labels=["A", "B"], known=[0.0, 1.0], notes=["angle", ""])
+    # White for 0, the palette's colour for 1, mixed linearly between
     empty, full = ax.collections[0].get_facecolors()
     assert empty.tolist() == [1, 1, 1, 1] and np.allclose(full[:3], to_rgb(colour(5)))
     half = graph(blank(), PAIR, known=[0.5, 0.5]).collections[0].get_facecolors()[0]
@@ -150,6 +154,7 @@ def test_a_slider_holds_its_frames_and_nothing_else():
     (image,) = find("img")
     (knob,) = find("input")
     assert image["alt"] == "A curve <falls>. rate 1 1/s."
+    # The page shows the frame `start`, at half of its pixels.
     first = base64.b64decode(image["src"].removeprefix("data:image/webp;base64,"))
     assert first == result.frames[2] and first[8:12] == b"WEBP"
     first_frame = Image.open(io.BytesIO(first))

@@ -140,6 +140,7 @@ def test_a_change_is_noticed_and_named() -> None:
         "not [100.0, 0.0, 0.0, 10.0, 0.1, 0.0] m, m/s",
         "gain: 0.1, not 0.05",
     )
+    # The digest depends on the values only, not on how they were set.
     back = other.replace(gain=0.05, initial_state=S["initial_state"])
     assert not back.changes and back.digest == S.digest != other.digest
 
@@ -204,6 +205,7 @@ def test_a_scenario_prints_every_parameter_and_its_reason() -> None:
 def test_reads_of_agents_are_recorded() -> None:
     one = S.track_reads()
     two = S.track_reads()
+    # Showing a scenario, or asking for changes, reads no cell for the study.
     repr(one), one._repr_html_(), one.digest, one.changes
     first = one.agents[0]
     assert (
@@ -284,6 +286,7 @@ def test_formulas_are_compared_without_spaces() -> None:
 
 
 def test_every_claim_has_to_hold() -> None:
+    # The order of the claims does not matter.
     match = judge_claims("grange", "Fig. 1", CLAIMS[::-1])
     assert match.verdict == "match" and "pca-stable holds: share 0" in match.ours
     assert "unstable" in match.published and match.why == ""
@@ -307,6 +310,7 @@ def test_a_rule_that_its_null_passes_too_shows_nothing() -> None:
             "pca-stable", "share", lambda s: s < limit, 0.02, 0.3, "a coin"
         )
 
+    # Limit 0.1: only ours passes. 0.5: the null passes too. 0.01: ours fails.
     verdicts = [
         judge_claims("grange", "Fig. 1", [CLAIMS[0], below(x), CLAIMS[2]], why="high")
         for x in (0.1, 0.5, 0.01)
@@ -344,6 +348,7 @@ def test_a_changed_scenario_is_not_compared() -> None:
         why = "changed scenario: gain: 0.1, not 0.05"
         assert (verdict.verdict, verdict.why) == ("not comparable", why)
         assert verdict.ours and verdict.published
+    # The accepted scenario itself is compared, recorded or not.
     for study in (None, S, S.track_reads()):
         assert (
             judge_claims("grange", "Fig. 1", CLAIMS, scenario=study).verdict == "match"

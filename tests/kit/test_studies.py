@@ -63,6 +63,7 @@ def test_neither_workers_nor_executor_change_a_bit() -> None:
     assert bits(studies.run(draw, SEEDS, workers=2)) == REFERENCE
     with ThreadPoolExecutor(3) as threads:
         assert bits(studies.run(draw, SEEDS, executor=threads)) == REFERENCE
+    # A spawned worker imports nothing of this module: the trial is sent by value.
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         assert bits(studies.run(draw, SEEDS, executor=pool)) == REFERENCE
 
@@ -254,6 +255,7 @@ def test_every_flipped_bit_is_refused_by_name(whole: Path, tmp_path: Path) -> No
     path = tmp_path / "b.csv"
     rng = np.random.default_rng(1)
     damaged = [b"", raw[:-20], raw + b"\n", raw.split(b"\n")[0]]
+    # One flipped bit anywhere: in the head, the seal, the rows or the last byte
     for place in [0, 30, len(raw) - 1, *rng.integers(len(raw), size=200)]:
         flipped = bytearray(raw)
         flipped[place] ^= 1 << rng.integers(8)
@@ -296,6 +298,7 @@ def test_parts_of_several_machines_merge(whole: Path, tmp_path: Path) -> None:
     for k in range(3):
         store(tmp_path / f"{k}.csv", indices=range(8 * k, 8 * k + 10))
     studies.merge(tmp_path / "a.csv", *(tmp_path / f"{k}.csv.part" for k in range(3)))
+    # Parts overlap in two trials, which are stored once.
     assert (tmp_path / "a.csv.part").read_text().count("\n7,") == 1
     assert store(tmp_path / "a.csv").read_bytes() == whole.read_bytes()
     store(tmp_path / "b.csv", indices=[0], parameters={"size": 41})

@@ -69,12 +69,14 @@ def test_a_sample_depends_on_the_seed_and_has_one_change_a_position(
 
 def test_tests_of_a_line_run_its_statement_or_function_or_module() -> None:
     text = "A = (\n    1\n)\n\ndef f(x,\n      y=2):\n    z = (x +\n         y)\n    return z\n"
+    # Lines and the tests that run them; '' is the import.
     contexts = {
         1: [""],
         5: [""],
         7: ["t.py::a[1]|run", "t.py::a[2]|run", ""],
         9: ["t.py::b|call"],
     }
+    # The statement of lines 7 and 8; line 6 belongs to the function only.
     assert mutants.running(contexts, text, 8) == ["t.py::a"]
     assert mutants.running(contexts, text, 9) == ["t.py::b"]
     assert mutants.running(contexts, text, 6) == ["t.py::a", "t.py::b"]

@@ -23,6 +23,7 @@ class SoftAssert(ast.NodeTransformer):
 
     def visit_Assert(self, node: ast.Assert) -> ast.If:
         """Return ``if not test: print(message)``; the default message is the test's source."""
+        # `print("no longer holds:", message)` as a syntax tree
         words = [
             ast.Constant("no longer holds:"),
             node.msg or ast.Constant(ast.unparse(node.test)),
@@ -34,6 +35,7 @@ class SoftAssert(ast.NodeTransformer):
 
 def use_soft_assert(shell: Any) -> None:
     """Let failed assertions of an IPython shell print, unless ``BOOK_STRICT`` is set."""
+    # Calling it twice must not install two transformers.
     installed = [type(transformer) for transformer in shell.ast_transformers]
     if "BOOK_STRICT" not in os.environ and SoftAssert not in installed:
         shell.ast_transformers.append(SoftAssert())

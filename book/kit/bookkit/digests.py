@@ -27,6 +27,7 @@ def _round(value: float, scale: float, *, max_decades: int) -> str:
     """Return four digits of `value`, but none `max_decades` decades below the first of `scale`."""
     if scale == 0 or abs(value) < 1e-9 * (1 - _OFFSET) * scale:
         return "0"
+    # Four digits of the value, or fewer if they would be finer than the scale allows.
     unit = 10.0 ** max(_decade(abs(value)) - 3, _decade(scale) - max_decades)
     steps = np.floor(value / unit + 0.5 + _OFFSET)
     return f"{steps * unit + 0.0:.4g}"
@@ -57,6 +58,7 @@ def _summary(values: Array) -> str:
         return f"{flat.size} values{missing}"
     finite = flat[is_finite]
     scale = float(np.abs(finite).max())
+    # The digits of the range are relative to its ends: no limit by the scale.
     low = _round(float(finite.min()), scale, max_decades=99)
     high = _round(float(finite.max()), scale, max_decades=99)
     # Terms cancel in mean and projection: their rounding errors scale with the largest entry.
@@ -173,6 +175,7 @@ _Entry = tuple[str, int, dict[str, Array]]
 
 def _panels(drawn: Any) -> Iterator[Any]:
     """Yield all axes, each followed by its insets; matplotlib need not be imported for it."""
+    # A figure has get_axes, axes have transData; an array or sequence has neither.
     if hasattr(drawn, "get_axes"):
         drawn = drawn.get_axes()
     elif hasattr(drawn, "transData"):
@@ -188,6 +191,7 @@ def _entries(axes: Any) -> Iterator[_Entry]:
         yield "line", 1, _by_axis(*np.transpose(line.get_xydata()))
     for _, group in groupby(_visible(axes.patches), key=type):
         patches = list(group)
+        # Outlines in the units of the data: the path of the unit shape, transformed.
         outlines = [
             p.get_patch_transform().transform(p.get_path().vertices) for p in patches
         ]
@@ -212,6 +216,7 @@ def _collection(artist: Any, data: Any) -> dict[str, Array]:
 
     The positions are the points' offsets. If all is drawn at one place, they are the outlines.
     """
+    # Points of a scatter plot, or the places of arrows
     offsets = np.ma.filled(artist.get_offsets(), np.nan)
     if len(offsets) > 1 or artist.get_offset_transform() == data:
         positions = _by_axis(*offsets.T)
@@ -220,6 +225,7 @@ def _collection(artist: Any, data: Any) -> dict[str, Array]:
         vertices = np.concatenate([np.empty((0, 2)), *outlines])
         positions = _by_axis(*vertices.T)
     sizes: Any = artist.get_sizes() if hasattr(artist, "get_sizes") else ()
+    # Values of the colours, components of arrows, and sizes of points that differ
     values = {
         "value": artist.get_array(),
         "u": getattr(artist, "U", None),

@@ -108,6 +108,7 @@ def use_style() -> None:
             "legend.frameon": False,
         }
     )
+    # Only a notebook has text forms of figures.
     if "IPython" in sys.modules:
         _print_digests()
 
@@ -214,6 +215,7 @@ def ellipse(
     ... )  # two standard deviations of 2.448
     4.9
     """
+    # x = m + r L (cos a, sin a) with P = L Lᵀ and r² the chi-square quantile
     centre = np.asarray(mean, dtype=float)
     root = factor(np.asarray(covariance, dtype=float))
     radius = np.sqrt(-2 * np.log1p(-level))
@@ -300,9 +302,11 @@ def graph(
     n = len(links)
     names = [str(k + 1) for k in range(n)] if labels is None else labels
     angles = 2 * np.pi * np.arange(n) / n
+    # Clockwise from the top; a single agent stands in the middle.
     circle = np.stack([np.sin(angles), np.cos(angles)], axis=-1) * (n > 1)
     places = circle if positions is None else np.asarray(positions, dtype=float)
     fill = np.zeros(n) if known is None else np.asarray(known, dtype=float)
+    # The upper triangle has each symmetric link once.
     for i, j in zip(*np.nonzero(np.triu(links, 1)), strict=True):
         ax.plot(*places[[i, j]].T, color="0.55", linewidth=1.2, zorder=1)
     # Mix with white instead of transparency, which would show the links behind a disc.

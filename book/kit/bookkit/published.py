@@ -73,6 +73,7 @@ class Item(NamedTuple):
     @property
     def file(self) -> str:
         """Name of its file in ``published/PAPER``, without the ending."""
+        # "Table II" has a Roman number, "Table 2" and "Fig. 1" have Arabic ones.
         kind, number = self.item.split()
         arabic = len(number) if set(number) == {"I"} else int(number)
         return f"{'table' if kind == 'Table' else 'figure'}-{arabic}"
@@ -177,6 +178,7 @@ def _judge(
     **evidence: str,
 ) -> Verdict:
     """Return the verdict; a changed scenario or an open input makes it "not comparable"."""
+    # A changed scenario comes before any other reason.
     if study is not None and study.changes:
         open_ = "changed scenario: " + "; ".join(study.changes)
     if open_:
@@ -318,10 +320,12 @@ def judge_claims(
             f"claims must be those of {paper} {item}, {', '.join(listed)}, each once, "
             f"got {', '.join(ids)}"
         )
+    # Texts of the verdict: ours in the order of the caller, the printed ones as listed
     ours = "; ".join(str(c) for c in claims)
     printed = "; ".join(row["claim"] for row in listed.values())
     all_hold = all(c.holds for c in claims)
     powerless = [c.id for c in claims if not c.has_power]
+    # A rule that its null passes too shows nothing.
     if all_hold and powerless and not free:
         free = f"the rule of {', '.join(powerless)} holds for its null too"
     null = "; ".join(f"{c.id}, {c.null}" for c in claims if c.null)
@@ -374,6 +378,7 @@ def judge_parameters(
     listed_item = _find_item(paper, item)
     printed = table(paper, listed_item.file)
     rows = read.cells() if isinstance(read, Scenario) else read
+    # Without a scenario, the recorded one says whether it was changed.
     study = read if scenario is None and isinstance(read, Scenario) else scenario
     why = _first_difference(rows, printed)
     count = f"{len(printed)} rows printed"
@@ -411,6 +416,7 @@ def _first_difference(
 ) -> str:
     """Describe the first printed cell that was not read, or read differently; '' if none."""
     first = next(iter(printed[0]))
+    # Rows are matched by the first printed column, in any order.
     by_key = {str(row[first]): row for row in rows}
     for printed_row in printed:
         key = printed_row.get(first, "")
@@ -422,5 +428,6 @@ def _first_difference(
             value = _cell(by_key[key][column])
             if not _same(value, text):
                 return f"row {key}, {column}: read {value}, printed {text}"
+    # Rows that the study used and the paper does not print
     extra = by_key.keys() - {printed_row[first] for printed_row in printed}
     return f"row {min(extra)} was read but is not printed" if extra else ""

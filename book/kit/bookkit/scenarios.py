@@ -66,6 +66,7 @@ class Parameter:
     note: str = ""
 
     def __post_init__(self) -> None:
+        # The dataclass is frozen: its own check may set a field only in this way.
         object.__setattr__(self, "value", _plain(self.value))
         _check_origin(vars(self))
 
@@ -144,6 +145,7 @@ class Row(Mapping[str, Any]):
         _check_origin(cells)
         kind = cells.get("kind", "")
         unit = cells["unit"]
+        # A kind that is not listed may have any unit, also this one.
         allowed = _UNITS.get(kind, (unit,))
         if unit not in allowed:
             raise ValueError(
@@ -159,6 +161,7 @@ class Row(Mapping[str, Any]):
         return self._cells[key]
 
     def __getattr__(self, name: str) -> Any:
+        # Private names must fail at once, or copying and pickling would recurse.
         if name.startswith("_") or name not in self._cells:
             raise AttributeError(name)
         return self[name]
@@ -238,6 +241,7 @@ class Scenario:
         value = self.parameter(key).value
         if not isinstance(value, tuple) or isinstance(value[0], str):
             return value
+        # Numbers become an array that a study cannot change.
         array = np.array(value)
         array.setflags(write=False)
         return array
@@ -341,6 +345,7 @@ class Scenario:
             tables += [([head, "value", *origin], texts)] if texts else []
         for name, rows in self.tables.items():
             columns = list(dict.fromkeys(c for row in rows for c in row.value_columns))
+            # Name and unit have columns of their own, at fixed places.
             columns = [c for c in columns if c not in ("name", "unit")]
             texts = [
                 [
@@ -398,6 +403,7 @@ def read_scenario(path: Path) -> Scenario:
     the names of paper and scenario.
     """
     folder = path.parent
+    # The entry that an error names; before the first one, the form of the file
     entry = "its form"
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -410,6 +416,7 @@ def read_scenario(path: Path) -> Scenario:
         tables: dict[str, tuple[Row, ...]] = {}
         for entry, rows in data.items():
             tables[entry] = tuple(Row(cells) for cells in rows)
+            # Equal names would leave fewer keys than rows.
             _check_links({row["name"]: row for row in tables[entry]}, len(rows))
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(f"{folder.name}/{path.name}: {entry}: {error}") from error

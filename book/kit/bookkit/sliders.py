@@ -103,6 +103,7 @@ class Slider:
     def _repr_mimebundle_(
         self, include: Any = None, exclude: Any = None
     ) -> dict[str, str]:
+        # Print and notebooks without scripts show the first frame as a PNG.
         still = io.BytesIO()
         Image.open(io.BytesIO(self.frames[self.start])).save(
             still, "png", compress_level=1
@@ -168,6 +169,7 @@ def slider(
     frames, sizes, digests = zip(
         *(_frame(draw(v), positions) for v in values), strict=True
     )
+    # One <img> of fixed size shows all frames.
     if len(set(sizes)) != 1:
         raise ValueError("draw must return figures of one size")
     return Slider(frames, sizes[0], labels, digests, label, alt, start)
@@ -180,6 +182,7 @@ def _frame(drawing: Any, positions: list[Any]) -> tuple[bytes, tuple[int, int], 
     do not move between frames.
     """
     figure = getattr(drawing, "figure", drawing)
+    # The layout engine would place panels differently for each frame.
     if positions:
         figure.set_layout_engine("none")
     for ax, position in zip(figure.axes, positions, strict=False):
@@ -188,6 +191,7 @@ def _frame(drawing: Any, positions: list[Any]) -> tuple[bytes, tuple[int, int], 
     text = of_axes(figure)
     pyplot.close(figure)
     canvas: Any = FigureCanvasAgg(figure)
+    # Twice the pixels of the page, for screens of high resolution
     figure.set_dpi(2 * figure.dpi)
     canvas.draw()
     positions[:] = positions or [ax.get_position(original=True) for ax in figure.axes]

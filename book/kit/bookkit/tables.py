@@ -52,9 +52,11 @@ class ResultTable:
     def _repr_html_(self) -> str:
         cells = {}
         for name in self.frame:
+            # The smallest or largest number of a column, which is set in bold
             best = self.frame[name].agg(self.best[name]) if name in self.best else None
             pairs = zip(self.frame[name], map(escape, self._format(name)), strict=True)
             cells[name] = [f"<b>{t}</b>" if value == best else t for value, t in pairs]
         page = self.frame.assign(**cells).to_html(escape=False, border=0)
+        # pandas has no caption; a page expects it before the head.
         head = f"<caption>{escape(self.caption)}</caption>\n<thead>"
         return str(page).replace("<thead>", head, 1)

@@ -103,6 +103,7 @@ def check(
             f"max_outliers must be below the number of trials, {len(chosen)}, "
             f"got {max_outliers}"
         )
+    # Tolerance of each metric; an ill-conditioned one may vary as the trials do.
     allowed = dict.fromkeys(stored.columns, atol)
     for name in ill_conditioned:
         finite = stored.columns[name][np.isfinite(stored.columns[name])]
@@ -137,6 +138,7 @@ def _differences(
     allowed: Mapping[str, float],
 ) -> list[str]:
     """Describe the differences of trial i, the k-th that ran again, from the stored one."""
+    # A failed trial has no metrics: compare the kinds of failure.
     if kind or stored.failures[i]:
         was = stored.failures[i] or "a value"
         now = kind or "a value"
@@ -154,6 +156,7 @@ def _same(was: float, now: float, rtol: float, atol: float) -> bool:
     """Return whether two numbers agree to the tolerances; NaN agrees with NaN."""
     if np.isnan(was) or np.isnan(now):
         return bool(np.isnan(was) and np.isnan(now))
+    # Exactly equal, with the sign of a zero
     if rtol == atol == 0 or np.isinf(was) or np.isinf(now):
         return was == now and bool(np.signbit(was) == np.signbit(now))
     return abs(was - now) <= max(rtol * abs(was), atol)

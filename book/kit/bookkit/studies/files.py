@@ -193,10 +193,12 @@ def store(
     """
     target = Path(path)
     seed_sequences = [fresh(seed) for seed in seeds]
+    # Rows of an earlier, unfinished call
     part = _Part(target, _head(trial, columns, parameters, code))
     n_head = len(_FIRST)
     rows = part.rows()
     texts = [seed_text(seed) for seed in seed_sequences]
+    # A row belongs to this study only if its seed is the same.
     for i, text in rows.items():
         if (
             i >= len(seed_sequences)
@@ -205,6 +207,7 @@ def store(
             raise ValueError(f"{part.path}: its trial {i} has another seed: remove it")
     chosen = range(len(seed_sequences)) if indices is None else indices
     items = [(i, seed_sequences[i]) for i in chosen if i not in rows]
+    # Deaths of workers are not stored: they may be the fault of the machine.
     deaths = []
     try:
         outcomes = running.outcomes(trial, items, executor, workers, one_by_one=True)
@@ -352,6 +355,7 @@ def load(path: str | Path) -> Stored:
     if form != _FORMAT or seal != _seal(body):
         raise ValueError(f"path: {source} is damaged, or was not written by store")
     metadata: dict[str, dict[str, Any]] = {"version": {}, "code": {}, "parameter": {}}
+    # The head: one line "# kind name: JSON" for each version, function and parameter
     lines = body.decode().split("\n")
     for match in filter(None, map(_HEADER.fullmatch, lines)):
         metadata[match[1]][match[2]] = json.loads(match[3])

@@ -200,6 +200,7 @@ def run(
     >>> study
     Study(100 trials: 100 done, 0 failed)
     """
+    # Copies, so that a trial cannot spawn from a seed of the caller.
     seed_sequences = tuple(fresh(seed) for seed in seeds)
     outcomes_by_index: dict[int, Outcome] = {}
     results = outcomes(trial, list(enumerate(seed_sequences)), executor, workers)
@@ -275,9 +276,11 @@ Job = tuple[bytes, str, dict[str, str]]
 def chunk(job: Job, items: Sequence[Item]) -> tuple[float, list[Outcome]]:
     """Run some trials; return how long they took, and their outcomes."""
     trial, started, expected = job
+    # Other versions may give other bits.
     if expected != versions():
         raise RuntimeError(f"a worker has {versions()}, the study {expected}")
     call = _loaded(trial)
+    # In a process of the caller, the number of threads is limited by the caller.
     if started != home():
         _one_blas_thread()
     start_time = time.perf_counter()
@@ -360,6 +363,7 @@ def pickle_by_value(folder: Path) -> None:
 
 
 def _pickle_trial(trial: Trial) -> bytes:
+    # Modules beside the trial and beside the script are sent by value.
     for name in (plain(trial).__module__, "__main__"):
         file = getattr(sys.modules[name], "__file__", None)
         if file and name not in sys.stdlib_module_names:

@@ -1,4 +1,4 @@
-"""News: against one Kalman filter of everybody's readings, and what must not be counted twice."""
+"""Information increments: against one Kalman filter of all observations; nothing counts twice."""
 
 from __future__ import annotations
 
@@ -75,10 +75,10 @@ def test_news_are_one_filter_with_everybodys_readings(
         state = f.step(state, k + 1.0, [[one, v] for one in y])
     m, p = joint(agents, readings, speed)
     for a, belief in enumerate(state.mixtures):
-        own = [0, 1, 2 + a]
-        assert np.allclose(belief.means[0], m[own], rtol=0, atol=1e-10)
+        ego = [0, 1, 2 + a]
+        assert np.allclose(belief.means[0], m[ego], rtol=0, atol=1e-10)
         # Egos have noise of their own, so an agent's target and its ego miss nothing else.
-        assert np.allclose(belief.covs[0], p[np.ix_(own, own)], rtol=0, atol=1e-10)
+        assert np.allclose(belief.covs[0], p[np.ix_(ego, ego)], rtol=0, atol=1e-10)
 
 
 def test_what_all_receive_counts_twice_if_it_is_told() -> None:
@@ -87,13 +87,16 @@ def test_what_all_receive_counts_twice_if_it_is_told() -> None:
     _, p = joint(2, readings, speed)
     start = network(2).start([PRIOR] * 2)
     once, twice = (
-        network(2, shared_components=c).step(start, 1.0, [[np.nan, 0.4]] * 2) for c in ([1], [])
+        network(2, shared_components=c).step(start, 1.0, [[np.nan, 0.4]] * 2)
+        for c in ([1], [])
     )
     assert np.allclose(once.mixtures[0].covs[0, :2, :2], p[:2, :2], atol=1e-10)
     assert once.ledger.scalars.sum() == 0
-    told = np.linalg.inv(twice.mixtures[0].covs[0, :2, :2])
-    alone = np.linalg.inv(T @ TARGET_COV @ T.T)
-    assert np.allclose(told - alone, 2 * (np.linalg.inv(p[:2, :2]) - alone), atol=1e-9)
+    sent = np.linalg.inv(twice.mixtures[0].covs[0, :2, :2])
+    single = np.linalg.inv(T @ TARGET_COV @ T.T)
+    assert np.allclose(
+        sent - single, 2 * (np.linalg.inv(p[:2, :2]) - single), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("rank", range(1, 5))
@@ -141,10 +144,10 @@ def test_no_zero_is_sent(rank: int, numbers: int) -> None:
 def test_news_that_are_lost_leave_the_own_belief() -> None:
     seen = [[0.7, np.nan], [-0.4, np.nan]]
     deaf = network(2, faults=Faults(loss=1.0))
-    alone = MixtureFilter(
+    single = MixtureFilter(
         MODEL, [EYE] * 2, target_dim=2, n_components=1, max_components=1
     )
-    a, b = (f.step(f.start([PRIOR] * 2), 1.0, seen) for f in (deaf, alone))
+    a, b = (f.step(f.start([PRIOR] * 2), 1.0, seen) for f in (deaf, single))
     for x, y in zip(a.mixtures, b.mixtures, strict=True):
         assert np.allclose(x.covs, y.covs) and np.allclose(x.means, y.means)
     assert a.ledger.lost.sum() == 2
@@ -163,7 +166,7 @@ def test_mixands_are_weighed_by_the_news() -> None:
     prior = GaussianMixture([0.3, 0.7], [[-2.0], [1.0]], [[[1.0]], [[2.0]]])
     one = GaussianMixture.gaussian([0.0], [[3.0]])
     after = f.step(f.start([one, prior]), 1.0, [[0.5], None]).mixtures[1]
-    # Means and variances of products of Gaussians; weights by what each mixand predicted.
+    # Means and variances of products of Gaussians; weights by each component's prediction.
     w = [0.3 * norm.pdf(0.5, -2, np.sqrt(2)), 0.7 * norm.pdf(0.5, 1, np.sqrt(3))]
     assert np.allclose(after.weights, np.array(w) / sum(w))
     assert np.allclose(after.means, [[-0.75], [2 / 3]])
@@ -193,7 +196,9 @@ def test_a_gated_reading_is_no_news() -> None:
         for g in (f, replace(f, exchange_interval=2.0))
     )
     assert np.allclose(a.mixtures[0].covs, b.mixtures[0].covs, atol=1e-12)
-    with pytest.raises(ValueError, match="shared_components must have noise that is independent"):
+    with pytest.raises(
+        ValueError, match="shared_components must have noise that is independent"
+    ):
         replace(f, sensors=[eye.replace(noise_cov=TARGET_COV)] * 2).step(start, 1.0, y)
 
 
@@ -216,21 +221,21 @@ def test_a_target_that_moves_with_noise_needs_readings_in_place_of_news(
 ) -> None:
     """Two agents with fixed doubtful places, ten readings each, on a line."""
     readings = np.random.default_rng(1).standard_normal((10, 2))
-    own = Model(2, lambda x, t, dt: x, lambda t, dt: np.diag([q, 0.0]))
-    alone = Sensor(1, lambda x: x[..., :1] - x[..., 1:], np.array([[0.3]]))
+    ego = Model(2, lambda x, t, dt: x, lambda t, dt: np.diag([q, 0.0]))
+    single = Sensor(1, lambda x: x[..., :1] - x[..., 1:], np.array([[0.3]]))
     prior = GaussianMixture.gaussian([0.0, 0.0], np.diag([4.0, 1.0]))
-    news = InformationIncrementFilter(own, [alone] * 2, graphs.path(2), target_dim=1)
+    news = InformationIncrementFilter(ego, [single] * 2, graphs.path(2), target_dim=1)
     all_ = Model(3, lambda x, t, dt: x, lambda t, dt: np.diag([q, 0.0, 0.0]))
     eyes = [
         Sensor(1, lambda x, a=a: x[..., :1] - x[..., a : a + 1], [[0.3]])
         for a in (1, 2)
     ]
-    told = GaussianFilter(all_, eyes, graphs.path(2))
+    shared = GaussianFilter(all_, eyes, graphs.path(2))
     one = news.start([prior] * 2)
-    both = told.start((np.zeros(3), np.diag([4.0, 1.0, 1.0])))
+    joint = shared.start((np.zeros(3), np.diag([4.0, 1.0, 1.0])))
     for k, y in enumerate(readings):
         one = news.step(one, k + 1.0, y[:, None])
-        both = told.step(both, k + 1.0, y[:, None])
+        joint = shared.step(joint, k + 1.0, y[:, None])
     h = np.array([[1.0, -1.0, 0.0], [1.0, 0.0, -1.0]])
     exact = kalman_filter(
         np.zeros(3),
@@ -241,9 +246,11 @@ def test_a_target_that_moves_with_noise_needs_readings_in_place_of_news(
         Q=np.diag([q, 0.0, 0.0]),
         R=0.3 * np.eye(2),
     )
-    assert np.allclose(both.means, exact.means[-1]) and both.ledger.scalars.sum() == 20
-    assert np.allclose(both.covariances, exact.covariances[-1])
-    variances = one.mixtures[0].covs[0, 0, 0], both.covariances[0, 0, 0]
+    assert (
+        np.allclose(joint.means, exact.means[-1]) and joint.ledger.scalars.sum() == 20
+    )
+    assert np.allclose(joint.covariances, exact.covariances[-1])
+    variances = one.mixtures[0].covs[0, 0, 0], joint.covariances[0, 0, 0]
     assert np.allclose(variances, (claimed, least), atol=1e-3)
-    gap = one.mixtures[0].means[0, 0] - both.means[0, 0]
+    gap = one.mixtures[0].means[0, 0] - joint.means[0, 0]
     assert (abs(gap) < 1e-9) == (q == 0.0)
