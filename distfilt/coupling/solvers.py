@@ -42,7 +42,7 @@ _NEWTON = 1000
 """Largest number of Newton steps; twenty are enough as a rule."""
 _OPTIMAL = 1e-9
 """A plan is solved again if its duality gap is a larger part of its cost."""
-_FORBIDDEN = 1e6
+_FORBIDDEN = 1e4
 """Costs that exceed all others by this factor are those of forbidden links."""
 
 
@@ -143,8 +143,8 @@ def transport_plan(
         other adds the plan's entropy to the cost.
     regularisation : float
         For ``"entropic"``: the weight of the entropy in units of the cost's range. Its plan is
-        spread out and costs more than the optimal one. Costs a million times larger than all
-        others do not count in the range, unless the plan needs these links.
+        spread out and costs more than the optimal one. Costs ten thousand times larger than
+        all others do not count in the range, unless the plan needs these links.
 
     Returns
     -------
@@ -261,15 +261,22 @@ def _largest_allowed(cost: Array) -> float | None:
     >>> _largest_allowed(np.array([[0.0, 1.0], [3.0, 1e9]]))
     3.0
     >>> _largest_allowed(np.array([[0.0, 1.0], [3.0, 9.0]]))
+    >>> _largest_allowed(np.array([[0.0, 1.0], [1e9, 0.0]]))
+    1.0
+
+    A plan has N + M - 1 links, so fewer cheap ones are no reason to forbid the others:
+
+    >>> _largest_allowed(squared_distances([[0.0], [1e-9], [1.0], [2.0]]))
     """
     shifted = cost - cost.min()
     # Every row and every column needs its cheapest link at least.
     needed = max(shifted.min(axis=1).max(), shifted.min(axis=0).max())
     values = np.sort(shifted[(shifted > 0) & (shifted >= needed)])
     gaps = np.flatnonzero(values[1:] > _FORBIDDEN * values[:-1])
-    if not gaps.size:
-        return None
-    return float(values[gaps[0]] + cost.min())
+    for limit in values[gaps].tolist():
+        if np.count_nonzero(shifted <= limit) >= sum(cost.shape) - 1:
+            return float(limit + cost.min())
+    return None
 
 
 def _improve(
@@ -383,7 +390,26 @@ def _solve_entropic(
     full_matrix[np.ix_(rows, columns)] = matrix
     potential = np.zeros(cost.shape[1])
     potential[columns] = g
+    # A corrected plan must not use forbidden links, whose costs are beyond the range.
+    if cost.max() > 1:
+        return _correct_in_proportion(full_matrix, a, b), potential
     return _correct_marginals(full_matrix, a, b), potential
+
+
+def _correct_in_proportion(matrix: Array, a: Array, b: Array) -> Array:
+    """Give a matrix its marginals by factors 1 + u_i + v_j, which keep empty links empty."""
+    for _ in range(3):
+        row_sums = matrix.sum(axis=1)
+        column_sums = matrix.sum(axis=0)
+        # diag(T1) u + T v = a - T1 and T'u + diag(T'1) v = b - T'1, singular along constants.
+        system = np.block(
+            [[np.diag(row_sums), matrix], [matrix.T, np.diag(column_sums)]]
+        )
+        errors = np.concatenate([a - row_sums, b - column_sums])
+        factors = np.linalg.lstsq(system, errors, rcond=1e-13)[0]
+        u, v = np.split(factors, [a.size])
+        matrix = matrix * np.maximum(1 + u[:, None] + v, 0.0)
+    return matrix
 
 
 def _plan_of_potential(

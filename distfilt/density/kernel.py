@@ -1,12 +1,24 @@
-"""Kernel estimates of a density on a grid: Gaussian kernels between reflecting walls."""
+"""Kernel estimates of a density on a grid: Gaussian kernels between reflecting walls.
+
+A width is a number, or has a row for each agent and a column for each axis: (N,) for each agent,
+(1, d) for each axis, (N, d) for both.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import warnings
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveFloat, PositiveInt, validated
+from ..validation import (
+    Array,
+    Bounds,
+    Indices,
+    PositiveFloat,
+    PositiveInt,
+    validated,
+)
 from .grid import Grid
 
 __all__ = [
@@ -17,7 +29,18 @@ __all__ = [
     "kernels",
 ]
 
-Widths = PositiveFloat | Annotated[Array, "n", Bounds(above=0)]
+AxisWidths = PositiveFloat | Annotated[Array, "1 grid.dim", Bounds(above=0)]
+"""One width for all axes, or one for each."""
+Widths = (
+    PositiveFloat
+    | Annotated[Array, "n", Bounds(above=0)]
+    | Annotated[Array, "1 grid.dim", Bounds(above=0)]
+    | Annotated[Array, "n grid.dim", Bounds(above=0)]
+)
+"""One width for all agents and axes, or one for each agent, each axis or both."""
+
+_NO_DISTANCE = 1e-9
+"""Positions that agree to this part of the box's width are the same place."""
 
 
 def _axis_kernels(x: Array, grid: Grid, k: int, width: Array) -> Array:
@@ -48,7 +71,10 @@ def _cell_masses(x: Array, edges: Array, scale: Array) -> Array:
 
 
 def check_resolution(grid: Grid, bandwidth: float | Array) -> None:
-    """Refuse bandwidths below half a cell, or far wider than the box."""
+    """Refuse bandwidths below half a cell, or far wider than the box; warn of a flat axis."""
+    if np.ndim(bandwidth) == 2:
+        _check_axis_widths(grid, np.asarray(bandwidth))
+        return
     if np.max(bandwidth) > 20 * grid.width.max():
         raise ValueError(
             f"bandwidth must be at most 20 widths of the box, got {bandwidth}"
@@ -61,15 +87,46 @@ def check_resolution(grid: Grid, bandwidth: float | Array) -> None:
             f"grid must have cells no wider than two bandwidths, {2 * least:g}, "
             f"got {widest:g}"
         )
+    # A width that covers one axis and not another is in the unit of the other.
+    if grid.width.min() < least < grid.width.max():
+        warnings.warn(
+            f"bandwidth must fit every axis of the box, got {least:g} for widths of "
+            f"{grid.width.min():g} to {grid.width.max():g}: the density will be flat along "
+            "the short one; give a width for each axis, (1, d)",
+            RuntimeWarning,
+            stacklevel=5,
+        )
+
+
+def _check_axis_widths(grid: Grid, bandwidth: Array) -> None:
+    """Refuse bandwidths (..., d) below half a cell, or far wider than the box, on any axis."""
+    if (bandwidth > 20 * grid.width).any():
+        raise ValueError(
+            "bandwidth must be at most 20 widths of the box along every axis, got "
+            f"{bandwidth.max(axis=0).tolist()}"
+        )
+    least = bandwidth.min(axis=0)
+    if (grid.spacing > 2 * least * (1 + 1e-12)).any():
+        raise ValueError(
+            "grid must have cells no wider than two bandwidths along every axis, "
+            f"{(2 * least).tolist()}, got {grid.spacing.tolist()}"
+        )
 
 
 def _factors(positions: Array, grid: Grid, bandwidth: float | Array) -> list[Array]:
     """Factors (..., N, n_k) of each agent's kernel, one for each axis."""
     check_resolution(grid, bandwidth)
     grid._check_inside(positions)
-    # One bandwidth for all agents, or one for each.
-    h = np.broadcast_to(bandwidth, positions.shape[:-1])
-    return [_axis_kernels(positions[..., k], grid, k, h) for k in range(grid.dim)]
+    if np.ndim(bandwidth) == 2:
+        widths = np.broadcast_to(bandwidth, positions.shape)
+    else:
+        # One bandwidth for all agents, or one for each, along every axis.
+        h = np.broadcast_to(bandwidth, positions.shape[:-1])
+        widths = np.broadcast_to(h[..., None], positions.shape)
+    return [
+        _axis_kernels(positions[..., k], grid, k, widths[..., k])
+        for k in range(grid.dim)
+    ]
 
 
 def _outer_products(product: Array, factors: list[Array]) -> Array:
@@ -94,8 +151,9 @@ def kernels(
         Agents inside the box.
     grid : Grid
         The kernels are given as means over its cells.
-    bandwidth : float or array_like, (N,)
-        Standard deviation of the Gaussian, in the positions' unit, at least half a cell.
+    bandwidth : float or array_like, (N,), (1, d) or (N, d)
+        Standard deviation of the Gaussian, in the positions' unit, at least half a cell: one for
+        all, or one for each agent, each axis, or both. Axes of different units need one each.
 
     Returns
     -------
@@ -107,12 +165,25 @@ def kernels(
         If an agent is outside or NaN, the bandwidth is not positive, or the cells are wider than
         two bandwidths.
 
+    Warns
+    -----
+    RuntimeWarning
+        If one bandwidth for all axes is wider than the box along one of them and not along
+        another.
+
     Examples
     --------
     >>> grid = Grid((20, 20))
     >>> z = kernels([[0.02, 0.5], [0.5, 0.5]], grid, bandwidth=0.08)
     >>> z.shape, bool(abs(grid.integral(z) - 1).max() < 1e-12)
     ((2, 400), True)
+
+    A position in metres beside a heading in rad:
+
+    >>> grid = Grid((20, 20), high=[1000.0, 1.0])
+    >>> z = kernels([[500.0, 0.5]], grid, bandwidth=[[80.0, 0.08]])
+    >>> bool(np.allclose(z * 1000, kernels([[0.5, 0.5]], Grid((20, 20)), bandwidth=0.08)))
+    True
     """
     factors = _factors(positions, grid, bandwidth)
     return _outer_products(factors[0], factors[1:])
@@ -149,12 +220,12 @@ def kernel_density(
 
 @validated
 def kernel_constant(
-    grid: Grid, *, bandwidth: PositiveFloat, agents: PositiveInt
+    grid: Grid, *, bandwidth: AxisWidths, agents: PositiveInt
 ) -> float:
     r"""The constant k̄ of Zheng and Lin: ∫K²/(N hᵈ), for which Var p_KDE ≈ k̄ p.
 
-    For a Gaussian, :math:`\bar k = 1/\bigl(N(2\sqrt\pi h)^d\bigr)`. It gives the variance of each
-    cell. The noise is not white, since neighbouring cells depend on the same agents: see
+    For a Gaussian, :math:`\bar k = 1/\bigl(N(2\sqrt\pi h)^d\bigr)`, with the product of the
+    bandwidths if there is one for each axis, (1, d). It gives the variance of each cell. The noise is not white, since neighbouring cells depend on the same agents: see
     :func:`kernel_covariance`.
 
     Examples
@@ -162,7 +233,11 @@ def kernel_constant(
     >>> round(kernel_constant(Grid((30, 30)), bandwidth=0.08, agents=100), 4)
     0.1243
     """
-    return float(1 / (agents * (2 * np.sqrt(np.pi) * bandwidth) ** grid.dim))
+    if np.ndim(bandwidth):
+        volume = np.prod(2 * np.sqrt(np.pi) * np.asarray(bandwidth))
+    else:
+        volume = (2 * np.sqrt(np.pi) * bandwidth) ** grid.dim
+    return float(1 / (agents * volume))
 
 
 @validated
@@ -170,7 +245,7 @@ def kernel_covariance(
     density: Annotated[Array, "grid.size", Bounds(at_least=0)],
     grid: Grid,
     *,
-    bandwidth: PositiveFloat,
+    bandwidth: AxisWidths,
     agents: PositiveInt,
 ) -> tuple[Array, Array]:
     r"""Mean and covariance of the kernel estimate of N independent agents, without approximation.
@@ -187,7 +262,7 @@ def kernel_covariance(
     density : array_like, (n,)
         The agents' true density, of integral 1; agents are at the centres of cells.
     grid : Grid
-    bandwidth : float
+    bandwidth : float or array_like, (1, d)
     agents : int
         Number N of agents.
 
@@ -222,7 +297,8 @@ def bandwidth(
     grid: Grid,
     *,
     rule: Literal["silverman", "least_squares"] = "silverman",
-) -> float:
+    each_axis: bool | None = None,
+) -> Any:
     r"""Choose a bandwidth from the agents' positions.
 
     Parameters
@@ -233,11 +309,17 @@ def bandwidth(
     rule : {"silverman", "least_squares"}
         Silverman's, :math:`\sigma\,(4/((d+2)N))^{1/(d+4)}` with the mean variance over axes, best
         for one Gaussian; or the minimum of the unbiased estimate of the integrated squared error,
-        :math:`\int\hat p^2-\tfrac2N\sum_i\hat p_{-i}(\mathbf X_i)`, over twenty candidates.
+        :math:`\int\hat p^2-\tfrac2N\sum_i\hat p_{-i}(\mathbf X_i)`, over twenty candidates. Agents
+        in one place would explain each other by the narrowest kernel. So rounded positions are
+        spread over the interval that was rounded, and agents that are in one place for another
+        reason are left out together.
+    each_axis : bool, optional
+        Whether every axis has a bandwidth of its own, in proportion to its standard deviation. By
+        default that is so unless the box has equal sides: then all axes have one unit.
 
     Returns
     -------
-    float
+    float, or ndarray (1, d) of one for each axis
         At least half a cell.
 
     Examples
@@ -245,6 +327,8 @@ def bandwidth(
     >>> x = np.random.default_rng(1).random((100, 2))
     >>> round(bandwidth(x, Grid((30, 30))), 3)
     0.129
+    >>> bandwidth(x * [1000.0, 1.0], Grid((30, 30), high=[1000.0, 1.0])).round(3)
+    array([[127.569,   0.131]])
     """
     grid._check_inside(positions)
     n, d = positions.shape
@@ -254,23 +338,92 @@ def bandwidth(
             f"positions must have two agents or more in different places, got {n} "
             f"with a spread of {spread:g}"
         )
+    if each_axis is None:
+        each_axis = bool(np.ptp(grid.width) > 1e-9 * grid.width.max())
     # No bandwidth may be below half a cell.
-    least = 0.5 * float(grid.spacing.max())
-    silverman = spread * (4 / ((d + 2) * n)) ** (1 / (d + 4))
+    least: Any = 0.5 * float(grid.spacing.max())
+    scale: Any = spread
+    if each_axis:
+        least = 0.5 * grid.spacing[None]
+        scale = positions.std(axis=0)[None]
+    silverman = scale * (4 / ((d + 2) * n)) ** (1 / (d + 4))
+    widest = np.maximum(silverman, least)
     if rule == "silverman":
-        return float(max(silverman, least))
+        return widest if each_axis else float(widest)
     # From far below Silverman's bandwidth, for clusters, to above it.
-    candidates = np.maximum(silverman * np.geomspace(0.15, 1.5, 20), least)
-    scores = [_cross_validation_score(positions, grid, h) for h in candidates]
-    return float(candidates[int(np.argmin(scores))])
+    factors = np.geomspace(0.15, 1.5, 20)
+    candidates = [np.maximum(silverman * factor, least) for factor in factors]
+    if not each_axis:
+        candidates = [float(h) for h in candidates]
+    spread_out = _undo_rounding(positions, grid)
+    places = _number_places(spread_out, grid)
+    scores = [_cross_validation_score(spread_out, grid, h, places) for h in candidates]
+    return candidates[int(np.argmin(scores))]
 
 
-def _cross_validation_score(x: Array, grid: Grid, h: float) -> float:
-    """∫p̂² - (2/N) Σ p̂₋ᵢ(Xᵢ), with the leave-one-out estimates p̂₋ᵢ."""
+def _number_places(x: Array, grid: Grid) -> Indices | None:
+    """Number the places of agents (N, d), the same for agents in one place; None without ties."""
+    unit = _NO_DISTANCE * grid.width
+    cells = np.round((x - grid.low) / unit)
+    places, index = np.unique(cells, axis=0, return_inverse=True)
+    if len(places) == len(x):
+        return None
+    return np.asarray(index.reshape(-1), dtype=np.intp)
+
+
+def _undo_rounding(x: Array, grid: Grid) -> Array:
+    """Spread agents (N, d) with ties on a lattice over its cells, evenly and without draws.
+
+    >>> line = Grid((9,), high=9.0)
+    >>> _undo_rounding(np.array([[3.0], [3.0], [4.0], [7.0]]), line).round(2).ravel()
+    array([2.81, 3.43, 4.04, 6.66])
+    """
+    steps = [_lattice_step(x[:, k], grid.width[k]) for k in range(grid.dim)]
+    if not any(steps):
+        return x
+    # Multiples of irrational numbers, taken modulo one, fill the unit interval evenly; agents in
+    # one place are next to each other in this order.
+    ratios = np.array([0.6180339887, 0.7548776662, 0.8191725134])[: grid.dim]
+    ranks = np.empty(len(x))
+    ranks[np.lexsort(x.T)] = np.arange(len(x))
+    offsets = ((0.5 + ranks[:, None] + 1) * ratios) % 1 - 0.5
+    moved = x + offsets * np.array(steps)
+    # Reflected at the walls, as the kernels are.
+    moved = grid.low + np.abs(moved - grid.low)
+    high = grid.low + grid.width
+    return np.asarray(high - np.abs(high - moved))
+
+
+def _lattice_step(values: Array, width: float) -> float:
+    """Return the step of the lattice on which tied coordinates lie; 0 without ties or lattice."""
+    unique = np.unique(np.round(values / (_NO_DISTANCE * width)))
+    if not 1 < len(unique) < len(values):
+        return 0.0
+    differences = np.diff(unique)
+    step = float(differences.min())
+    multiples = differences / step
+    # All differences are multiples of the smallest, but for rounding.
+    is_lattice = np.abs(multiples - np.round(multiples)).max() < 0.01
+    return step * _NO_DISTANCE * width if is_lattice else 0.0
+
+
+def _cross_validation_score(
+    x: Array, grid: Grid, h: float | Array, places: Indices | None = None
+) -> float:
+    """∫p̂² - (2/N) Σ p̂₋ᵢ(Xᵢ), with the leave-one-out estimates p̂₋ᵢ.
+
+    With numbers of the agents' places, all agents in the place of agent i are left out.
+    """
     n = len(x)
     z = kernels(x, grid, bandwidth=h)
     mean = z.mean(axis=0)
     # Entry (i, j) is the kernel of agent i in the cell of agent j; the diagonal is left out.
     pairs = z[:, grid.cell_index(x)]
-    leave_one_out = (pairs.sum() - np.trace(pairs)) / (n * (n - 1))
+    if places is None:
+        leave_one_out = (pairs.sum() - np.trace(pairs)) / (n * (n - 1))
+    else:
+        is_other = places[:, None] != places
+        # Each estimate is a mean over the agents that remain.
+        remaining = is_other.sum(axis=0)
+        leave_one_out = ((pairs * is_other).sum(axis=0) / remaining).mean()
     return float((mean**2).sum() * grid.volume - 2 * leave_one_out)

@@ -217,7 +217,7 @@ class GaussianFilter(
         d = state.dim
         mean, slope, extra = self._linearize(
             partial(model.step, t=state.t, dt=dt),
-            partial(model.jacobian, t=state.t, dt=dt, std=deviations(state.covariances)),
+            partial(model.jacobian, t=state.t, dt=dt),
             state.means,
             state.covariances,
             isinstance(model, LinearModel),
@@ -242,7 +242,7 @@ class GaussianFilter(
     def _linearize(
         self,
         function: Callable[[Array], Array],
-        jacobian: Callable[[Array], Array],
+        jacobian: Callable[..., Array],
         mean: Array,
         cov: Array,
         is_linear: bool,
@@ -250,7 +250,10 @@ class GaussianFilter(
         """Return value, slope and extra covariance of a function of a Gaussian (..., d)."""
         if is_linear or self.linearization == "extended":
             # For a linear function unscented points would give the same.
-            return function(mean[..., None, :])[..., 0, :], jacobian(mean), 0.0
+            value = function(mean[..., None, :])[..., 0, :]
+            # Differences are scaled by the state's standard deviations.
+            slope = jacobian(mean) if is_linear else jacobian(mean, std=deviations(cov))
+            return value, slope, 0.0
         root = cholesky(cov)
         d = mean.shape[-1]
         points, weights = unscented_points(mean, root, kappa=self.kappa)
@@ -286,16 +289,15 @@ class GaussianFilter(
         mean = joint_mean[..., block]
         cov = joint_cov[..., block, block]
         linear = group.linear
-        jacobian = partial(group.jacobian, std=deviations(cov))
         predicted, slope, extra = self._linearize(
-            group.predict, jacobian, mean, cov, linear
+            group.predict, group.jacobian, mean, cov, linear
         )
 
         def moments_on_one_branch(_: Array) -> tuple[Array, Array]:
             """Return the moments about one branch, whatever the observed angle is."""
             predict = partial(group.predict, same_branch=True)
             value, h, remainder = self._linearize(
-                predict, jacobian, mean, cov, linear
+                predict, group.jacobian, mean, cov, linear
             )
             return value, h @ cov @ h.mT + remainder
 

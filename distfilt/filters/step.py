@@ -561,7 +561,7 @@ class Received:
             values[index] = wrapped.swapaxes(-1, -2)
         return predicted
 
-    def jacobian(self, states: Array, std: Array) -> Array:
+    def jacobian(self, states: Array, std: Array | None = None) -> Array:
         """Return the derivatives of the observations at states (*runs, G, d), (*runs, G, M, d).
 
         `std` holds the standard deviations of the states' components, (*runs, G, d).
@@ -573,7 +573,8 @@ class Received:
         for part in self.parts:
             # H of the sensor's agents, (*runs, agents, m, d)
             rows = (..., part.agents, slice(None))
-            slope = part.sensor.jacobian(states[rows], std=std[rows])
+            part_std = None if std is None else std[rows]
+            slope = part.sensor.jacobian(states[rows], std=part_std)
             result[(..., *part.cells, slice(None))] = slope
         return result
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -100,6 +102,37 @@ def _is_adjacency(numbers: np.ndarray, n_agents: int | None) -> bool:
 def is_networkx(value: Any) -> bool:
     """Return whether a value has the attributes of networkx's graphs."""
     return all(hasattr(value, name) for name in ("nodes", "edges", "is_directed"))
+
+
+def order_nodes(nodes: Sequence[Any], names: Sequence[Any]) -> Sequence[Any]:
+    """Return the nodes of a networkx graph in the order of the agents.
+
+    >>> order_nodes([3, 1, 2], [])
+    [1, 2, 3]
+    >>> order_nodes([3, 1, 2], ["a", "b", "c"])
+    Traceback (most recent call last):
+    ValueError: graph must have the nodes ['a', 'b', 'c'], got [3, 1, 2]
+    """
+    labels = set(nodes)
+    if labels == set(range(len(nodes))):
+        return range(len(nodes))
+    if names:
+        # A node is the agent of its label, also of a number that is written like a name.
+        node_of = {str(node): node for node in nodes} | {node: node for node in nodes}
+        order = [node_of[name] for name in names if name in node_of]
+        if len(order) != len(nodes) or set(order) != labels or len(names) != len(nodes):
+            raise ValueError(f"graph must have the nodes {list(names)}, got {nodes}")
+        return order
+    # Other labels have no order of their own.
+    return sorted(nodes) if _are_integers(nodes) else nodes
+
+
+def _are_integers(nodes: Sequence[Any]) -> bool:
+    """Whether labels are integers, or tuples of as many integers each."""
+    tuples = [node if isinstance(node, tuple) else (node,) for node in nodes]
+    if len({(type(node) is tuple, len(t)) for node, t in zip(nodes, tuples, strict=True)}) > 1:
+        return False
+    return all(isinstance(label, Integral) for entries in tuples for label in entries)
 
 
 def build_links(n_agents: int, pairs: Indices, name: str) -> scipy.sparse.csr_array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from functools import partial
 from typing import Annotated, Any, Literal, TypeVar
@@ -21,11 +21,20 @@ from ..validation import (
 from .faults import Faults
 from .graphs import Graph, as_graph
 from .ledger import Ledger, count_payload, mask_lost
-from .weights import ConsensusWeights, _check_same_links, stack_weights
+from .weights import (
+    ConsensusWeights,
+    _check_same_links,
+    interleave_weights,
+    stack_weights,
+)
 
 __all__ = ["Channel", "LossRule", "PerAgent", "fusion_rule", "kind_of_rule"]
 
 _PERFECT = Faults()
+
+_BLOCK_SIZE = 2**15
+"""Number of messages whose losses are drawn at a time."""
+
 _Values = Annotated[Array, "*self.runs self.graph.n_agents k"]
 
 PerAgent = Annotated[Array, "*channel.runs channel.graph.n_agents k"]
@@ -95,7 +104,7 @@ class Channel:
         # message.
         self._uncharged: dict[int, int] = {}
         # Messages on their way in a channel with a delay, by the shape of the values.
-        self._queues: dict[tuple[int, ...], deque[tuple[Array, Mask]]] = {}
+        self._queues: dict[tuple[int, ...], tuple[deque[Array], deque[Mask]]] = {}
         self._perfect = self.faults.is_perfect
         if not self._perfect:
             self.faults.check_graph(self.graph)
@@ -194,8 +203,8 @@ class Channel:
         _check_same_links(weights, self.graph)
         if self._perfect:
             return self._mix_without_faults(values, weights, rounds)
-        for _ in range(rounds):
-            values, _ = self._mix_once(values, weights, on_loss)
+        for values, _ in self._mix_rounds(values, weights, on_loss, rounds):
+            pass
         return values
 
     @validated
@@ -252,6 +261,12 @@ class Channel:
         if self._perfect:
             mixed = self._mix_without_faults(values, weights, 1)
             return mixed, weights.self_weights
+        return next(self._mix_rounds(values, weights, on_loss, 1))
+
+    def _mix_rounds(
+        self, values: Array, weights: ConsensusWeights, on_loss: LossRule, rounds: int
+    ) -> Iterator[tuple[Array, Array]]:
+        """Mix with faults; after each round the values, and the weights that own values got."""
         both_ways = on_loss in ("mutual", "metropolis")
         if both_ways and self.graph.is_directed:
             raise ValueError(
@@ -262,36 +277,71 @@ class Channel:
         # Metropolis weights need the degree of the links that are left, one number
         # more.
         numbers = size + 1 if on_loss == "metropolis" else size
-        arrived = self._transmit_numbers(
-            numbers, acknowledged=both_ways, may_delay=True
-        )
         flat = values.reshape(-1, size)
+        # Losses and weights of many rounds at once, as many as the cache holds.
+        block = max(1, _BLOCK_SIZE // (1 + self._n_drawn * self.graph.senders.size))
+        while rounds > 0:
+            used = np.ones(self.graph.senders.size, dtype=bool)
+            count = min(rounds, block)
+            arrived = self._transmit_rounds(
+                count, used, numbers, 8 * numbers, acknowledged=both_ways
+            )
+            rounds -= count
+            for flat, self_weights in self._mix_block(flat, weights, arrived, on_loss):
+                mixed = flat.reshape(values.shape)
+                yield mixed, self_weights.reshape(*self.runs, self.graph.n_agents)
+
+    def _mix_block(
+        self, flat: Array, weights: ConsensusWeights, arrived: Mask, on_loss: LossRule
+    ) -> Iterator[tuple[Array, Array]]:
+        """Mix values (R A, k) in rounds of which messages have arrived, (rounds, R, E)."""
+        graph = self.graph
+        received = flat
+        offset = 0
         if self.faults.total_delay:
-            # Own values are present, received ones late: they stand below in one
-            # product.
-            received, arrived = self._delay(flat, arrived)
-            factors = np.concatenate([flat, received])
+            # Which messages of earlier rounds arrive now; their values follow below.
             offset = len(flat)
-        else:
-            factors = flat
-            offset = 0
+            arrived = self._delay_arrivals(flat.shape, arrived)
+        n_rounds, n_runs, n_links = arrived.shape
         self_weights, link_weights = _weights_after_loss(
-            self.graph, weights, arrived, on_loss
+            graph, weights, arrived.reshape(-1, n_links), on_loss
         )
         matrix = stack_weights(
-            self.graph, self_weights, link_weights, received_offset=offset
+            graph, self_weights[:n_runs], link_weights[:n_runs], received_offset=offset
         )
-        mixed = (matrix @ factors).reshape(values.shape)
-        return mixed, self_weights.reshape(*self.runs, self.graph.n_agents)
+        # The matrices of all rounds differ in their entries only.
+        entries = interleave_weights(graph, self_weights, link_weights)
+        entries = entries.reshape(n_rounds, -1)
+        by_round = self_weights.reshape(n_rounds, n_runs, graph.n_agents)
+        for k in range(n_rounds):
+            matrix.data = entries[k]
+            factors = flat
+            if offset:
+                # Own values are present, received ones late: they stand below in one
+                # product.
+                received = self._delay_values(flat)
+                factors = np.concatenate([flat, received])
+            flat = matrix @ factors
+            yield flat, by_round[k]
 
-    def _delay(self, values: Array, arrived: Mask) -> tuple[Array, Mask]:
-        """Return the values of some rounds ago, and on which links those arrive now."""
-        queue = self._queues.setdefault(values.shape, deque())
-        queue.append((values.copy(), arrived))
+    def _delay_values(self, values: Array) -> Array:
+        """Return the values of some rounds ago; zeros, without a weight, before the first."""
+        queue, _ = self._queues.setdefault(values.shape, (deque(), deque()))
+        queue.append(values.copy())
         if len(queue) > self.faults.total_delay:
             return queue.popleft()
-        # Nothing has arrived yet.
-        return np.zeros_like(values), np.zeros_like(arrived)
+        return np.zeros_like(values)
+
+    def _delay_arrivals(self, shape: tuple[int, ...], arrived: Mask) -> Mask:
+        """Return for each round which messages of some rounds ago arrive, (rounds, R, E)."""
+        _, queue = self._queues.setdefault(shape, (deque(), deque()))
+        delayed = np.zeros_like(arrived)
+        for k, links in enumerate(arrived):
+            queue.append(links)
+            # Nothing arrives before the first message has been on its way for so long.
+            if len(queue) > self.faults.total_delay:
+                delayed[k] = queue.popleft()
+        return delayed
 
     def _transmit_numbers(
         self,
@@ -299,13 +349,12 @@ class Channel:
         links: Mask | None = None,
         *,
         acknowledged: bool = False,
-        may_delay: bool = False,
     ) -> Mask:
         """Send so many floats over some links, all by default; which arrive, (R, E)."""
         if links is None:
             links = np.ones(self.graph.senders.size, dtype=bool)
         return self._transmit(
-            links, numbers, 8 * numbers, acknowledged=acknowledged, may_delay=may_delay
+            links, numbers, 8 * numbers, acknowledged=acknowledged
         )
 
     def _transmit(
@@ -315,35 +364,61 @@ class Channel:
         bytes_: Any,
         *,
         acknowledged: bool = False,
-        may_delay: bool = False,
     ) -> Mask:
         """Charge one round on the links in use, and return which messages arrive, (R, E)."""
-        if self.faults.total_delay and not may_delay:
+        if self.faults.total_delay:
             raise ValueError(
                 "channel must have no delay here, "
                 f"got one of {self.faults.total_delay} rounds"
             )
-        ledger = self.ledger
-        graph = self.graph
-        if self._perfect:
-            everywhere = np.broadcast_to(used, (self._n_drawn, used.size))
-            arrived = everywhere[self._drawn]
-            lost = np.zeros(graph.n_agents)
-        else:
-            # Radios that are off send nothing, which costs nothing.
-            used = used & self.faults.active_links(graph, ledger.rounds, self.t)
-            draws = self.faults.draw_losses(graph, ledger.rounds, self._n_drawn, self.t)
-            arrived = used & ~draws[self._drawn]
-            # The ledger has the mean over the runs.
-            missing = (used & ~arrived).mean(axis=0)
-            lost = self._count_by_agent(graph.senders, missing).astype(float)
-        messages = self._count_by_agent(graph.senders[used])
-        ledger = self._charge(ledger, messages, scalars, bytes_, lost=lost)
+        if not self._perfect:
+            return self._transmit_rounds(
+                1, used, scalars, bytes_, acknowledged=acknowledged
+            )[0]
+        everywhere = np.broadcast_to(used, (self._n_drawn, used.size))
+        messages = self._count_by_agent(self.graph.senders[used])
+        ledger = self._charge(self.ledger, messages, scalars, bytes_)
         if acknowledged:
             # One byte back for each message, in the same round.
-            replies = self._count_by_agent(graph.receivers[used])
+            replies = self._count_by_agent(self.graph.receivers[used])
             ledger = self._charge(ledger, replies, 0, 1, rounds=0)
         self._ledger = ledger
+        return np.asarray(everywhere[self._drawn])
+
+    def _transmit_rounds(
+        self, count: int, used: Mask, scalars: Any, bytes_: Any, *, acknowledged: bool
+    ) -> Mask:
+        """Charge some rounds with faults, and return which messages arrive, (count, R, E)."""
+        graph = self.graph
+        ledger = self.ledger
+        # A graph without links has no rounds, so that their number does not grow.
+        step = 1 if graph.senders.size else 0
+        rounds = [ledger.rounds + k * step for k in range(count)]
+        # Radios that are off send nothing, which costs nothing.
+        on = [self.faults.active_links(graph, round_, self.t) for round_ in rounds]
+        used_by_round = used & np.array(on)
+        draws = self.faults.draw_rounds(
+            graph, range(rounds[0], rounds[0] + count), self._n_drawn, self.t
+        )
+        arrived = used_by_round[:, None] & ~draws[:, self._drawn]
+        # The ledger has the mean over the runs, and the sum over rounds one after the other.
+        missing = (used_by_round[:, None] & ~arrived).mean(axis=1)
+        lost = ledger.lost
+        for row in missing:
+            lost = lost + self._count_by_agent(graph.senders, row)
+        uses = used_by_round.sum(axis=0)
+        messages = self._count_by_agent(graph.senders, uses).astype(np.int64)
+        # One byte back for each message, in the same round.
+        replies = np.zeros_like(messages)
+        if acknowledged:
+            replies = self._count_by_agent(graph.receivers, uses).astype(np.int64)
+        self._ledger = ledger.replace(
+            rounds=ledger.rounds + count * step,
+            messages=ledger.messages + messages + replies,
+            scalars=ledger.scalars + messages * scalars,
+            bytes=ledger.bytes + messages * bytes_ + replies,
+            lost=lost,
+        )
         return np.asarray(arrived)
 
     def _count_by_agent(self, agents: Indices, weights: Array | None = None) -> Any:

@@ -17,6 +17,7 @@ from ..linalg import SolverError
 from ..validation import (
     Array,
     FrozenModel,
+    Indices,
     PositiveFloat,
     PositiveInt,
     call_user,
@@ -29,6 +30,7 @@ from .weights import (
     ConsensusWeights,
     _check_keeps_average,
     _laplacian_weights,
+    _warn_if_not_converging,
     _warn_if_unstable,
     metropolis,
 )
@@ -45,11 +47,45 @@ __all__ = [
 
 
 class Disconnected(RuntimeWarning):
-    """A graph that is not connected, so that each component reaches an average of its own.
+    """A network in several parts, each of which reaches a result of its own.
 
     >>> issubclass(Disconnected, RuntimeWarning)
     True
     """
+
+
+def _warn_if_disconnected(
+    channel: Channel, rounds: int | None = None, *, stacklevel: int = 4
+) -> None:
+    """Warn if messages cannot lead from every agent to every other, however many rounds.
+
+    One round says nothing, as a graph that changes may be connected over time. Agents that
+    are silent for a while may be heard later; those that are silent always have no links.
+    """
+    if rounds == 1:
+        return
+    graph = channel.graph
+    silent = channel.faults.always_silent
+    components = _components(graph, silent) if silent else graph.components
+    count = int(components.max()) + 1
+    if count > 1:
+        because = f" with agents {sorted(silent)} silent" if silent else ""
+        warnings.warn(
+            "channel must have a connected graph to reach one average, "
+            f"got {count} components{because}, each of which reaches its own",
+            Disconnected,
+            # Over the rule and its validation to the rule's caller.
+            stacklevel=stacklevel,
+        )
+
+
+@lru_cache(maxsize=32)
+def _components(graph: Graph, silent: frozenset[int]) -> Indices:
+    """Return the strongly connected components that remain without some agents' links, (A,)."""
+    off = np.isin(np.arange(graph.n_agents), list(silent))
+    on_links = ~(off[graph.receivers] | off[graph.senders])
+    pairs = np.stack([graph.receivers[on_links], graph.senders[on_links]], axis=1)
+    return Graph.from_edges(graph.n_agents, pairs, directed=True).components
 
 
 def _check_single_run(channel: Channel) -> None:
@@ -93,9 +129,10 @@ def average_consensus(
         graph is connected and γ < 2/λ_max of its Laplacian; above that an
         :class:`UnstableGain` warns.
     weights : ConsensusWeights, optional
-        Weights in place of a gain; Metropolis by default. They must keep the average:
-        symmetric ones do, and :func:`distfilt.network.weights.doubly_stochastic` on a
-        digraph.
+        Weights in place of a gain; Metropolis by default. Their rows and columns must sum
+        to one: those of symmetric weights do, and of
+        :func:`distfilt.network.weights.doubly_stochastic` on a digraph. An
+        :class:`UnstableGain` warns of weights that do not converge.
     on_loss : str
         Where the weight of a lost message goes: see :meth:`Channel.mix`.
 
@@ -117,16 +154,10 @@ def average_consensus(
         weights = _laplacian_weights(graph, gain)
     elif weights is None:
         weights = metropolis(graph)
+    else:
+        _warn_if_not_converging(weights, rounds)
     _check_keeps_average(weights)
-    if rounds > 1 and not graph.is_connected:
-        count = graph.components.max() + 1
-        warnings.warn(
-            "channel must have a connected graph to reach one average, "
-            f"got {count} components, each of which reaches its own",
-            Disconnected,
-            # Over the validation of this function to its caller.
-            stacklevel=3,
-        )
+    _warn_if_disconnected(channel, rounds)
     return channel.mix(values, weights, on_loss=on_loss, rounds=rounds)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..validation import Array, Bounds, NonNegativeFloat, PositiveInt, validated
 from .channel import Channel, PerAgent, fusion_rule
-from .consensus import _check_single_run
+from .consensus import _check_single_run, _warn_if_disconnected
 from .weights import metropolis
 
 __all__ = ["event_triggered"]
@@ -39,7 +39,8 @@ def event_triggered(
         One vector per agent.
     channel : Channel
         Links both ways, a single run, no delay. Acknowledgements tell which messages
-        were lost; these are sent again.
+        were lost; these are sent again. A graph of several components gives a
+        :class:`Disconnected` warning.
     rounds : int
         Number of rounds.
     threshold : float
@@ -70,6 +71,7 @@ def event_triggered(
     _check_single_run(channel)
     graph = channel.graph
     graph._check_undirected()
+    _warn_if_disconnected(channel, rounds)
     x = values
     link_weights = metropolis(graph).link_weights[:, None]
     faulty = not channel.faults.is_perfect

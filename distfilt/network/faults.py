@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated, Any
 
 import numpy as np
@@ -157,6 +157,15 @@ class Faults(FrozenModel):
         return True
 
     @cached_property
+    def always_silent(self) -> frozenset[int]:
+        """Agents that are silent at all times."""
+        silent: set[int] = set()
+        for faults in self._flatten():
+            if faults.during is None:
+                silent.update(faults.silent)
+        return frozenset(silent)
+
+    @cached_property
     def total_delay(self) -> int:
         """Rounds by which a message arrives later, all delays together."""
         return sum(faults.delay for faults in self._flatten())
@@ -175,10 +184,23 @@ class Faults(FrozenModel):
         self, graph: Graph, round_: int, runs: int, t: float | None = None
     ) -> Mask:
         """Return which links lose the message of round `round_` in each run, (runs, E)."""
-        lost = np.zeros((runs, graph.senders.size), dtype=bool)
+        return self.draw_rounds(graph, range(round_, round_ + 1), runs, t)[0]
+
+    def draw_rounds(
+        self, graph: Graph, rounds: range, runs: int, t: float | None = None
+    ) -> Mask:
+        """Return the losses of some rounds one after the other, (rounds, runs, E).
+
+        Those of :meth:`draw_losses`, for a fraction of the time a round.
+        """
+        lost = np.zeros((len(rounds), runs, graph.senders.size), dtype=bool)
         for faults in self._flatten():
-            if np.any(faults.loss) and faults._is_active(round_, t):
-                lost |= faults._draw_round(graph, round_, runs)
+            if not np.any(faults.loss):
+                continue
+            active = [faults._is_active(round_, t) for round_ in rounds]
+            if any(active):
+                draws = faults._draw_rounds(graph, rounds, runs)
+                lost |= draws & np.array(active)[:, None, None]
         return lost
 
     def _is_active(self, round_: int, t: float | None) -> bool:
@@ -188,11 +210,11 @@ class Faults(FrozenModel):
         now = round_ if t is None else t
         return any(start <= now < stop for start, stop in self.during)
 
-    def _draw_round(self, graph: Graph, round_: int, runs: int) -> Mask:
-        """Return the losses of one round, (runs, E), whatever the window."""
+    def _draw_rounds(self, graph: Graph, rounds: range, runs: int) -> Mask:
+        """Return the losses of some rounds, (rounds, runs, E), whatever the window."""
         probability = self._link_probabilities(graph)
         link_bits = _link_bits(graph)
-        uniform = _uniform(self._run_bits([round_], runs).T ^ link_bits)
+        uniform = _uniform(self._run_bits(rounds, runs)[:, :, None] ^ link_bits)
         if self.burst_length is None:
             return np.asarray(uniform < probability)
 
@@ -207,8 +229,11 @@ class Faults(FrozenModel):
         # u < enter: lost. enter <= u < enter + stay: as in the round before. Else it
         # arrives.
         lost = uniform < enter
-        unknown = np.nonzero(~lost & (uniform < enter + stay))
-        self._look_back(lost, unknown, round_, link_bits, enter, stay)
+        goes_on = ~lost & (uniform < enter + stay)
+        unknown = np.nonzero(goes_on[0])
+        self._look_back(lost[0], unknown, rounds[0], link_bits, enter, stay)
+        for k in range(1, len(rounds)):
+            lost[k] |= goes_on[k] & lost[k - 1]
         return np.asarray(lost)
 
     def _look_back(
@@ -263,6 +288,7 @@ def _check_windows(during: Any) -> tuple[tuple[float, float], ...]:
     return tuple((float(start), float(stop)) for start, stop in ends)
 
 
+@lru_cache(maxsize=32)
 def _link_bits(graph: Graph) -> Hashes:
     """Return random bits for each link, (E,), which depend on its two agents alone."""
     numbers = graph.receivers * graph.n_agents + graph.senders

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..validation import Array, Mask, PositiveInt, validated
 from .channel import Channel, PerAgent
-from .consensus import _check_single_run
+from .consensus import _check_single_run, _warn_if_disconnected
 
 __all__ = ["flooding"]
 
@@ -25,7 +25,7 @@ def flooding(
         One vector per agent.
     channel : Channel
         A single run. k + 1 scalars for each value that is forwarded; a lost one is not
-        sent again.
+        sent again. A graph of several components gives a :class:`Disconnected` warning.
     rounds : int, optional
         Number of rounds; by default until no agent has a new value to forward.
 
@@ -46,6 +46,7 @@ def flooding(
     array([ 6, 12,  6])
     """
     _check_single_run(channel)
+    _warn_if_disconnected(channel, rounds)
     n_agents = channel.graph.n_agents
     # A row to send: the number of the agent and its value.
     numbers = np.arange(n_agents)[:, None]

@@ -26,6 +26,7 @@ from ..validation import (
     validated,
 )
 from .channel import Channel, fusion_rule
+from .consensus import _warn_if_disconnected
 from .graphs import Graph
 from .weights import _laplacian_weights, _warn_if_unstable
 
@@ -219,6 +220,7 @@ def consensus_pull(
            [3.]])
     """
     _warn_if_unstable(channel.graph, gain)
+    _warn_if_disconnected(channel, rounds)
     means, covs = belief
     weights = _laplacian_weights(channel.graph, gain)
     # m <- (I - γ L) m; the weight of a lost mean stays with the own one.
@@ -275,6 +277,7 @@ def mean_pull(
     if gain == 0:
         return pulled
     _warn_if_unstable(channel.graph, gain)
+    _warn_if_disconnected(channel, rounds)
     weights = _laplacian_weights(channel.graph, gain)
     for _ in range(rounds):
         means = pulled.mean(axis=-2)
@@ -363,6 +366,8 @@ def _repeat(
     belief: Pair, channel: Channel, rounds: int, fuse: Callable[[_Received], Pair]
 ) -> Pair:
     """Exchange means and upper triangles of covariances and fuse them, some times."""
+    # Over the rule that calls this function, and the rule's validation.
+    _warn_if_disconnected(channel, rounds, stacklevel=5)
     means, covs = belief
     graph = channel.graph
     d = means.shape[-1]

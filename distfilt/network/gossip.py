@@ -6,6 +6,7 @@ import numpy as np
 
 from ..validation import Array, PositiveInt, Rng, validated
 from .channel import Channel, PerAgent, fusion_rule
+from .consensus import _warn_if_disconnected
 
 __all__ = ["gossip_consensus"]
 
@@ -29,7 +30,8 @@ def gossip_consensus(
         One vector per agent.
     channel : Channel
         Links both ways, no delay. If one of a pair's two messages is lost, which
-        acknowledgements tell, the pair keeps its values.
+        acknowledgements tell, the pair keeps its values. A graph of several components
+        gives a :class:`Disconnected` warning.
     rounds : int
         Number of pairs; 2 messages of k scalars each.
     rng : numpy.random.Generator
@@ -66,6 +68,7 @@ def gossip_consensus(
     """
     graph = channel.graph
     graph._check_undirected()
+    _warn_if_disconnected(channel, rounds)
     averaged = values.copy()
     # All pairs are drawn first: an agent, and the number of one of its neighbours.
     agents = rng.integers(graph.n_agents, size=rounds)

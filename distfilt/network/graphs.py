@@ -109,12 +109,16 @@ class Graph(FrozenModel):
         Parameters
         ----------
         graph : networkx.Graph or networkx.DiGraph
-            Of a digraph an edge runs from sender to receiver. Names, weights and
-            parallel edges are not kept.
+            Of a digraph an edge (u, v) is a pair of :meth:`from_edges`, and an entry of
+            the matrix of :meth:`from_adjacency`: node u receives from node v. A digraph
+            whose edges run from sender to receiver is ``graph.reverse()``. Names,
+            weights and parallel edges are not kept.
         names : sequence of str
-            Names of the agents. If the nodes are these names, or the numbers 0 to A -
-            1, each node is the agent of its label; otherwise nodes are numbered in the
-            graph's order. A graph in which only some nodes are names is refused.
+            Names of the agents. Nodes that are these names, or numbers written like
+            them, are the agents of their label, and so are the numbers 0 to A - 1. A
+            graph with other nodes is refused. Without names, nodes that are integers
+            (as labels from 1 on) or tuples of them are numbered in their order, others
+            in the graph's.
 
         Examples
         --------
@@ -131,21 +135,11 @@ class Graph(FrozenModel):
         nodes = list(graph.nodes)
         if not nodes:
             raise ValueError("graph must have at least one node, got none")
-        if set(nodes) == set(range(len(nodes))):
-            order: Sequence[Any] = range(len(nodes))
-        elif set(nodes) == set(names):
-            order = names
-        else:
-            order = nodes
-            # Some names among other nodes are more likely a mistake than labels.
-            if set(names) & set(nodes):
-                raise ValueError(
-                    f"graph must have the nodes {list(names)}, got {nodes}"
-                )
+        order = _links.order_nodes(nodes, names)
         number_of = {node: number for number, node in enumerate(order)}
-        # An edge (u, v) of networkx runs from u to v, a pair here is (receiver,
-        # sender). Edges of a multigraph have a key as third entry.
-        edges = [(number_of[edge[1]], number_of[edge[0]]) for edge in graph.edges]
+        # An edge (u, v) is a pair (receiver, sender), as in the matrix of networkx, whose
+        # row u has the entry v. Edges of a multigraph have a key as third entry.
+        edges = [(number_of[edge[0]], number_of[edge[1]]) for edge in graph.edges]
         return cls.from_edges(len(nodes), edges, directed=bool(graph.is_directed()))
 
     @cached_property

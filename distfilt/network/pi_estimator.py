@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -16,7 +17,8 @@ from ..validation import (
     validated,
 )
 from .channel import Channel, PerAgent
-from .weights import _laplacian_weights
+from .consensus import _warn_if_disconnected
+from .weights import UnstableGain, _laplacian_weights
 
 __all__ = ["PIState", "pi_start", "pi_step", "stable_substeps"]
 
@@ -89,7 +91,12 @@ def stable_substeps(
     """
     if alpha + a == 0:
         raise ValueError("alpha must be positive if a is 0, or nothing damps, got 0")
-    largest = 2 * float(channel.graph.in_degree.max())
+    limit = _stable_step(2 * float(channel.graph.in_degree.max()), alpha, a, b)
+    return max(1, int(np.ceil(2 * dt / limit)))
+
+
+def _stable_step(largest: float, alpha: float, a: float, b: float) -> float:
+    """Return the step below which all modes up to the eigenvalue `largest` shrink."""
     # Without links and with alpha = 0 nothing moves, and any step will do.
     damping = max(alpha + a * largest, 1e-300)
     coupling = b * largest
@@ -99,7 +106,26 @@ def stable_substeps(
     limit = 2 / damping
     if 2 * coupling > damping:
         limit = min(limit, damping / coupling**2)
-    return max(1, int(np.ceil(2 * dt / limit)))
+    return limit
+
+
+def _warn_if_unstable_step(
+    channel: Channel, h: float, alpha: float, a: float, b: float
+) -> None:
+    """Warn the user of substeps with which the estimates diverge on this graph."""
+    graph = channel.graph
+    # Most steps are below a bound from the degrees, which costs no eigenvalues.
+    if h <= _stable_step(2 / graph.degree_bound_gain, alpha, a, b):
+        return
+    limit = _stable_step(2 / graph.max_stable_gain, alpha, a, b)
+    if h > limit * (1 + 1e-9):
+        warnings.warn(
+            f"substeps must be more than {h / limit:.3g} times as many for the estimates to "
+            f"stay bounded, got steps of {h:.6g} s for a limit of {limit:.6g} s",
+            UnstableGain,
+            # Over `pi_step` and its validation to its caller.
+            stacklevel=4,
+        )
 
 
 @validated
@@ -157,6 +183,8 @@ def pi_step(
     array([2., 2.])
     """
     channel.graph._check_undirected()
+    # A step is one of many, whatever the number of its substeps.
+    _warn_if_disconnected(channel)
     if state.estimate.shape != inputs.shape:
         raise ValueError(
             f"state must have shape {inputs.shape}, got {state.estimate.shape}"
@@ -166,6 +194,8 @@ def pi_step(
     slope: Array | float = 0.0 if rate is None else rate
     # The derivative of the inputs, and the number of Euler steps.
     n = substeps or stable_substeps(channel, dt, alpha=alpha, a=a, b=b)
+    if substeps is not None:
+        _warn_if_unstable_step(channel, dt / substeps, alpha, a, b)
     h = dt / n
     k = inputs.shape[-1]
     # One exchange of (ν, η): mixing with I - h L, less the values themselves, gives -h

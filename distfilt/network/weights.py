@@ -25,8 +25,15 @@ __all__ = [
 ]
 
 
+_DENSE = 400
+"""Up to this many agents the eigenvalues of weights are computed to check them."""
+
+_POWER_ROUNDS = 100
+"""Rounds between two measurements of growth, for more agents."""
+
+
 class UnstableGain(RuntimeWarning):
-    """A gain above 2/λ_max, with which averaging diverges.
+    """A gain above 2/λ_max, or weights, with which averaging does not converge.
 
     Turn it into an error, or off, by ``warnings.filterwarnings("error",
     category=UnstableGain)``.
@@ -69,6 +76,26 @@ class ConsensusWeights(FrozenModel):
             self.graph, self.self_weights[None], self.link_weights[None]
         )
 
+    @cached_property
+    def convergence_factor(self) -> float:
+        r"""The factor by which a round shrinks the slowest mode of differences.
+
+        The largest modulus of the eigenvalues of
+        :math:`\mathbf W-\mathbf 1\mathbf 1^\top\!/A`. Weights whose rows and columns sum to one
+        lead every agent to the average if and only if it is below 1. A dense solver finds it,
+        for up to some thousand agents.
+
+        >>> from distfilt.network import graphs
+        >>> round(metropolis(graphs.path(3)).convergence_factor, 4)
+        0.6667
+        """
+        deviation = self.matrix.toarray() - 1 / self.graph.n_agents
+        if (deviation == deviation.T).all():
+            eigenvalues = np.linalg.eigvalsh(deviation)
+        else:
+            eigenvalues = np.linalg.eigvals(deviation)
+        return float(np.abs(eigenvalues).max())
+
 
 def stack_weights(
     graph: Graph, self_weights: Array, link_weights: Array, *, received_offset: int = 0
@@ -83,22 +110,35 @@ def stack_weights(
         The matrix multiplies the runs' values, one below the other. With 0 the received
         values are the same ones; delayed values stand so many rows below.
     """
+    data = interleave_weights(graph, self_weights, link_weights)
     n_runs, n_agents = self_weights.shape
-    row_starts = graph.links.indptr[:-1]
     run = np.arange(n_runs)[:, None]
-    # Every row of a run: the diagonal entry, then those of the links, ascending by
-    # sender. Sums are added in this order, which makes them those of a loop over
-    # messages to the bit.
-    data = np.insert(link_weights, row_starts, self_weights, axis=1)
     diagonal = np.arange(n_agents) + n_agents * run
     received = graph.senders + n_agents * run + received_offset
-    columns = np.insert(received, row_starts, diagonal, axis=1)
+    columns = np.insert(received, graph.links.indptr[:-1], diagonal, axis=1)
     # Each row is longer by the diagonal entry; a run follows the other.
     row_ends = graph.links.indptr[1:] + np.arange(1, n_agents + 1)
     row_ends = row_ends + data.shape[1] * run
     pointers = np.concatenate([[0], row_ends.ravel()])
     shape = (n_runs * n_agents, n_runs * n_agents + received_offset)
     return scipy.sparse.csr_array((data.ravel(), columns.ravel(), pointers), shape)
+
+
+def interleave_weights(
+    graph: Graph, self_weights: Array, link_weights: Array
+) -> Array:
+    """Return the entries of a matrix of weights in their order, (R, A + E).
+
+    Every row: the diagonal entry, then those of the links, ascending by sender. Sums are
+    added in this order, which makes them those of a loop over messages to the bit.
+    """
+    n_agents = graph.n_agents
+    # A diagonal entry stands before the links of its row, and after those of the rows above.
+    diagonal = graph.links.indptr[:-1] + np.arange(n_agents)
+    entries = np.empty((len(self_weights), n_agents + graph.senders.size))
+    entries[:, diagonal] = self_weights
+    entries[:, np.arange(graph.senders.size) + graph.receivers + 1] = link_weights
+    return entries
 
 
 def _check_same_links(weights: ConsensusWeights, graph: Graph) -> None:
@@ -381,21 +421,78 @@ def _left_null_vector(laplacian: scipy.sparse.csr_array) -> Array:
 
 
 def _check_keeps_average(weights: ConsensusWeights) -> None:
-    """Refuse weights of which a column does not sum to one."""
+    """Refuse weights of which a column or a row does not sum to one."""
     graph = weights.graph
     # Not by the matrix: scipy's sums sort its entries in place, which changes how sums
     # round.
-    columns = weights.self_weights + np.bincount(
-        graph.senders, weights.link_weights, graph.n_agents
+    _check_sums_to_one(weights, graph.senders, "columns", "keep the average")
+    _check_sums_to_one(
+        weights,
+        graph.receivers,
+        "rows",
+        "keep agents that agree as they are (those of column_stochastic are for push_sum)",
     )
+
+
+def _warn_if_not_converging(weights: ConsensusWeights, rounds: int) -> None:
+    """Warn the user of weights with which averaging diverges, or stays as it is."""
+    graph = weights.graph
+    if _converges_plainly(weights):
+        return
+    is_small = graph.n_agents <= _DENSE
+    factor = weights.convergence_factor if is_small else _growth(weights)
+    # A single round may leave differences as they are, where weights change in time. Those of
+    # parts without a link remain, which a warning of its own says.
+    diverges = factor > 1 + 1e-9
+    stalls = rounds > 1 and graph.is_connected and factor > 1 - 1e-12
+    if diverges or stalls:
+        warnings.warn(
+            "weights must have eigenvalues below 1 in modulus, but for the average's, for the "
+            f"agents to agree, got {factor:.6g}",
+            UnstableGain,
+            # Over the consensus rule and its validation to the caller of the rule.
+            stacklevel=4,
+        )
+
+
+def _growth(weights: ConsensusWeights) -> float:
+    """Return the factor by which the differences of many agents grow in a round, in the end."""
+    # A random start has a part of every mode; a fixed seed makes the result repeatable.
+    x = np.random.default_rng(0).standard_normal(weights.graph.n_agents)
+    sizes = []
+    for _ in range(2):
+        for _ in range(_POWER_ROUNDS):
+            x = weights.matrix @ x
+            x = x - x.mean()
+        sizes.append(float(np.linalg.norm(x)))
+        # Scaled, as it may have become very large or very small.
+        x = x / max(sizes[-1], 1e-300)
+    return sizes[-1] ** (1 / _POWER_ROUNDS)
+
+
+def _check_sums_to_one(
+    weights: ConsensusWeights, agents: Indices, name: str, purpose: str
+) -> None:
+    """Refuse weights of which a row (by receivers) or a column (by senders) misses one."""
+    n_agents = weights.graph.n_agents
+    link_weights = weights.link_weights
+    sums = weights.self_weights + np.bincount(agents, link_weights, n_agents)
     # Rounding grows with the weights that cancel in a sum.
-    scale = np.abs(weights.self_weights) + np.bincount(
-        graph.senders, np.abs(weights.link_weights), graph.n_agents
-    )
-    error = np.abs(columns - 1) / np.maximum(1.0, scale)
+    scale = np.abs(weights.self_weights)
+    scale = scale + np.bincount(agents, np.abs(link_weights), n_agents)
+    error = np.abs(sums - 1) / np.maximum(1.0, scale)
     worst = int(error.argmax())
     if error[worst] > 1e-9:
         raise ValueError(
-            "weights must have columns that sum to 1 to keep the average, "
-            f"got {columns[worst]:.6g} for agent {worst}"
+            f"weights must have {name} that sum to 1 to {purpose}, "
+            f"got {sums[worst]:.6g} for agent {worst}"
         )
+
+
+def _converges_plainly(weights: ConsensusWeights) -> bool:
+    """Whether signs alone show that averaging converges: no weight is negative or missing.
+
+    A nonnegative matrix with a positive diagonal has no eigenvalue of modulus 1 but 1 itself,
+    which is simple if no link of a connected graph lacks its weight (Perron and Frobenius).
+    """
+    return bool((weights.self_weights > 0).all() and (weights.link_weights > 0).all())
