@@ -6,7 +6,14 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveFloat, PositiveInt, validated
+from ..validation import (
+    Array,
+    ArrayInput,
+    Bounds,
+    PositiveFloat,
+    PositiveInt,
+    validated,
+)
 from .grid import Grid
 
 __all__ = [
@@ -17,7 +24,7 @@ __all__ = [
     "kernels",
 ]
 
-Widths = PositiveFloat | Annotated[Array, "n", Bounds(above=0)]
+Widths = PositiveFloat | Annotated[ArrayInput, "n", Bounds(above=0)]
 
 
 def _axis_kernels(x: Array, grid: Grid, k: int, width: Array) -> Array:
@@ -82,7 +89,7 @@ def _outer_products(product: Array, factors: list[Array]) -> Array:
 
 @validated
 def kernels(
-    positions: Annotated[Array, "... n grid.dim"], grid: Grid, *, bandwidth: Widths
+    positions: Annotated[ArrayInput, "... n grid.dim"], grid: Grid, *, bandwidth: Widths
 ) -> Array:
     """Kernel of each agent, the z_i of equation (13) of Zheng and Lin.
 
@@ -120,7 +127,7 @@ def kernels(
 
 @validated
 def kernel_density(
-    positions: Annotated[Array, "... n grid.dim"], grid: Grid, *, bandwidth: Widths
+    positions: Annotated[ArrayInput, "... n grid.dim"], grid: Grid, *, bandwidth: Widths
 ) -> Array:
     """The kernel estimate of agents' density, equation (4) of Zheng and Lin.
 
@@ -167,7 +174,7 @@ def kernel_constant(
 
 @validated
 def kernel_covariance(
-    density: Annotated[Array, "grid.size", Bounds(at_least=0)],
+    density: Annotated[ArrayInput, "grid.size", Bounds(at_least=0)],
     grid: Grid,
     *,
     bandwidth: PositiveFloat,
@@ -218,7 +225,7 @@ def kernel_covariance(
 
 @validated
 def bandwidth(
-    positions: Annotated[Array, "n grid.dim"],
+    positions: Annotated[ArrayInput, "n grid.dim"],
     grid: Grid,
     *,
     rule: Literal["silverman", "least_squares"] = "silverman",

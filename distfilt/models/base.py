@@ -14,6 +14,7 @@ import numpy as np
 from ..linalg import central_difference, evaluate_derivative, factor
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
     FrozenModel,
     NonNegativeFloat,
@@ -85,7 +86,7 @@ class Model(FrozenModel):
 
     @validated
     def step(
-        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat
+        self, x: Annotated[ArrayInput, "... self.dim"], t: float, dt: NonNegativeFloat
     ) -> Array:
         """Move states (..., d) from `t` to `t` + `dt`, without noise."""
         return call_batched(self, "transition", (x,), t, dt)
@@ -112,7 +113,7 @@ class Model(FrozenModel):
     @validated
     def sample_step(
         self,
-        x: Annotated[Array, "... self.dim"],
+        x: Annotated[ArrayInput, "... self.dim"],
         t: float,
         dt: NonNegativeFloat,
         *,
@@ -129,7 +130,7 @@ class Model(FrozenModel):
 
     @validated
     def jacobian(
-        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat
+        self, x: Annotated[ArrayInput, "... self.dim"], t: float, dt: NonNegativeFloat
     ) -> Array:
         """Derivative of a step from states (..., d), as (..., d, d).
 
@@ -207,7 +208,7 @@ class LinearModel(Model):
 
     @validated
     def step(
-        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat
+        self, x: Annotated[ArrayInput, "... self.dim"], t: float, dt: NonNegativeFloat
     ) -> Array:
         """Move states (..., d) from `t` to `t` + `dt`, without noise."""
         if self.time_invariant:
@@ -259,7 +260,7 @@ class LinearModel(Model):
 
     @validated
     def jacobian(
-        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat
+        self, x: Annotated[ArrayInput, "... self.dim"], t: float, dt: NonNegativeFloat
     ) -> Array:
         """Derivative of a step, the same matrix for all states, as (..., d, d)."""
         return np.full((*x.shape, self.dim), self.F(dt))
@@ -290,7 +291,7 @@ def _noise_of_step(model: LinearModel, dt: float) -> tuple[Array, Array]:
 @validated
 def simulate(
     model: Model,
-    x0: Annotated[Array, "... model.dim"],
+    x0: Annotated[ArrayInput, "... model.dim"],
     times: Times,
     *,
     rng: Rng,

@@ -12,8 +12,10 @@ import numpy as np
 
 from ..validation import (
     Array,
+    ArrayInput,
     Indices,
     Mask,
+    MaskInput,
     PositiveInt,
     skip_validation,
     validated,
@@ -26,9 +28,9 @@ from .weights import ConsensusWeights, _check_same_links, stack_weights
 __all__ = ["Channel", "LossRule", "PerAgent", "fusion_rule", "kind_of_rule"]
 
 _PERFECT = Faults()
-_Values = Annotated[Array, "*self.runs self.graph.n_agents k"]
+_Values = Annotated[ArrayInput, "*self.runs self.graph.n_agents k"]
 
-PerAgent = Annotated[Array, "*channel.runs channel.graph.n_agents k"]
+PerAgent = Annotated[ArrayInput, "*channel.runs channel.graph.n_agents k"]
 """One vector for each agent of an argument named `channel`."""
 
 LossRule = Literal["mutual", "metropolis", "keep", "renormalise", "zero"]
@@ -196,14 +198,14 @@ class Channel:
             return self._mix_without_faults(values, weights, rounds)
         for _ in range(rounds):
             values, _ = self._mix_once(values, weights, on_loss)
-        return values
+        return np.asarray(values)
 
     @validated
     def send_on_links(
         self,
-        values: Annotated[Array, "*self.runs self.graph.senders.size k"],
+        values: Annotated[ArrayInput, "*self.runs self.graph.senders.size k"],
         *,
-        links: Annotated[Mask, "self.graph.senders.size"] | None = None,
+        links: Annotated[MaskInput, "self.graph.senders.size"] | None = None,
         acknowledged: bool = False,
     ) -> Array:
         """Send a different payload along each link.
