@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..ensembles import Ensemble
 from ..derivatives import difference_with_error, evaluate_derivative
+from ..ensembles import Ensemble
 from ..linalg import SolverError
 from ..validation import (
     Array,

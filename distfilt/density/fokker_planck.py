@@ -14,6 +14,7 @@ from ..models.base import trajectory
 from ..models.swarm import Swarm
 from ..validation import (
     Array,
+    ArrayInput,
     FrozenModel,
     Indices,
     NonNegativeFloat,
@@ -27,7 +28,7 @@ __all__ = ["FokkerPlanck", "bernoulli"]
 
 
 @validated
-def bernoulli(z: Annotated[Array, "..."]) -> Array:
+def bernoulli(z: Annotated[ArrayInput, "..."]) -> Array:
     """The function z / (exp(z) - 1), 1 at 0: the weight of Scharfetter and Gummel's flux.
 
     Examples
@@ -40,7 +41,7 @@ def bernoulli(z: Annotated[Array, "..."]) -> Array:
     series = 1 - z / 2 + z**2 / 12
     nonzero = np.where(small, 1.0, z)
     ratio = nonzero / np.expm1(np.clip(nonzero, -700.0, 700.0))
-    return np.where(small, series, ratio)
+    return np.asarray(np.where(small, series, ratio))
 
 
 class _Faces(NamedTuple):
@@ -177,7 +178,7 @@ class FokkerPlanck(FrozenModel):
     @validated
     def step(
         self,
-        values: Annotated[Array, "... self.grid.size"],
+        values: Annotated[ArrayInput, "... self.grid.size"],
         t: float,
         dt: PositiveFloat,
     ) -> Array:
@@ -249,7 +250,7 @@ class FokkerPlanck(FrozenModel):
 
     @validated
     def evolve(
-        self, values: Annotated[Array, "... self.grid.size"], times: Times
+        self, values: Annotated[ArrayInput, "... self.grid.size"], times: Times
     ) -> Array:
         """Densities at `times`, (T, ..., n), from `values` at time 0, by one step to each time.
 

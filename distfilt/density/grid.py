@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..models.swarm import check_inside
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
     FrozenModel,
     Indices,
@@ -123,17 +124,17 @@ class Grid(FrozenModel):
         check_inside(positions, np.asarray(self.low), np.asarray(self.high))
 
     @validated
-    def integral(self, values: Annotated[Array, "... self.size"]) -> Array:
+    def integral(self, values: Annotated[ArrayInput, "... self.size"]) -> Array:
         """Integral over the box of cell values (..., n)."""
         return np.asarray(values.sum(axis=-1) * self.volume)
 
     @validated
-    def norm(self, values: Annotated[Array, "... self.size"]) -> Array:
+    def norm(self, values: Annotated[ArrayInput, "... self.size"]) -> Array:
         """L2 norm over the box of cell values (..., n)."""
         return np.asarray(np.sqrt((values**2).sum(axis=-1) * self.volume))
 
     @validated
-    def normalize(self, values: Annotated[Array, "... self.size"]) -> Array:
+    def normalize(self, values: Annotated[ArrayInput, "... self.size"]) -> Array:
         """Divide cell values (..., n) by their integral, which has to be positive."""
         integral = values.sum(axis=-1) * self.volume
         if not (integral > 0).all():
@@ -143,7 +144,7 @@ class Grid(FrozenModel):
         return np.asarray(values / integral[..., None])
 
     @validated
-    def cell_index(self, positions: Annotated[Array, "... self.dim"]) -> Indices:
+    def cell_index(self, positions: Annotated[ArrayInput, "... self.dim"]) -> Indices:
         """Flat index of the cell in which each of the positions (..., d) lies, (...)."""
         self._check_inside(positions)
         index = ((positions - self.low) / self.spacing).astype(np.int64)
@@ -153,7 +154,7 @@ class Grid(FrozenModel):
         return np.asarray(np.ravel_multi_index(axes, self.shape))
 
     @validated
-    def histogram(self, positions: Annotated[Array, "... n self.dim"]) -> Array:
+    def histogram(self, positions: Annotated[ArrayInput, "... n self.dim"]) -> Array:
         """Histogram of agents (..., N, d), one or more, as a density (..., n)."""
         agents = positions.shape[-2]
         cells = self.cell_index(positions).reshape(-1, agents)
@@ -165,8 +166,8 @@ class Grid(FrozenModel):
     @validated
     def interpolate(
         self,
-        values: Annotated[Array, "self.size"],
-        positions: Annotated[Array, "... self.dim"],
+        values: Annotated[ArrayInput, "self.size"],
+        positions: Annotated[ArrayInput, "... self.dim"],
     ) -> Array:
         """Interpolate cell values (n,) linearly at positions (..., d); constant next to walls."""
         from scipy.ndimage import map_coordinates

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
     Indices,
     PositiveFloat,
@@ -29,13 +30,13 @@ __all__ = [
     "kernels",
 ]
 
-AxisWidths = PositiveFloat | Annotated[Array, "1 grid.dim", Bounds(above=0)]
+AxisWidths = PositiveFloat | Annotated[ArrayInput, "1 grid.dim", Bounds(above=0)]
 """One width for all axes, or one for each."""
 Widths = (
     PositiveFloat
-    | Annotated[Array, "n", Bounds(above=0)]
-    | Annotated[Array, "1 grid.dim", Bounds(above=0)]
-    | Annotated[Array, "n grid.dim", Bounds(above=0)]
+    | Annotated[ArrayInput, "n", Bounds(above=0)]
+    | Annotated[ArrayInput, "1 grid.dim", Bounds(above=0)]
+    | Annotated[ArrayInput, "n grid.dim", Bounds(above=0)]
 )
 """One width for all agents and axes, or one for each agent, each axis or both."""
 
@@ -139,7 +140,7 @@ def _outer_products(product: Array, factors: list[Array]) -> Array:
 
 @validated
 def kernels(
-    positions: Annotated[Array, "... n grid.dim"], grid: Grid, *, bandwidth: Widths
+    positions: Annotated[ArrayInput, "... n grid.dim"], grid: Grid, *, bandwidth: Widths
 ) -> Array:
     """Kernel of each agent, the z_i of equation (13) of Zheng and Lin.
 
@@ -191,7 +192,7 @@ def kernels(
 
 @validated
 def kernel_density(
-    positions: Annotated[Array, "... n grid.dim"], grid: Grid, *, bandwidth: Widths
+    positions: Annotated[ArrayInput, "... n grid.dim"], grid: Grid, *, bandwidth: Widths
 ) -> Array:
     """The kernel estimate of agents' density, equation (4) of Zheng and Lin.
 
@@ -242,7 +243,7 @@ def kernel_constant(
 
 @validated
 def kernel_covariance(
-    density: Annotated[Array, "grid.size", Bounds(at_least=0)],
+    density: Annotated[ArrayInput, "grid.size", Bounds(at_least=0)],
     grid: Grid,
     *,
     bandwidth: AxisWidths,
@@ -293,7 +294,7 @@ def kernel_covariance(
 
 @validated
 def bandwidth(
-    positions: Annotated[Array, "n grid.dim"],
+    positions: Annotated[ArrayInput, "n grid.dim"],
     grid: Grid,
     *,
     rule: Literal["silverman", "least_squares"] = "silverman",

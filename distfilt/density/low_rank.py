@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from ..validation import (
     Array,
+    ArrayInput,
     FrozenModel,
     PositiveFloat,
     call_user,
@@ -36,7 +37,9 @@ __all__ = [
 ]
 
 Transition = Callable[[Array], Array]
-Observed = Annotated[Array, "*state.base.shape"] | Annotated[Array, "state.size"]
+Observed = (
+    Annotated[ArrayInput, "*state.base.shape"] | Annotated[ArrayInput, "state.size"]
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +68,7 @@ class Dense(FrozenModel):
 def dense_step(
     state: Dense,
     transition: Transition,
-    observed: Annotated[Array, "*state.mean.shape"],
+    observed: Annotated[ArrayInput, "*state.mean.shape"],
     noise: ArrayLike,
     dt: PositiveFloat,
 ) -> Dense:
@@ -196,8 +199,8 @@ class LowRank(FrozenModel):
 
 @validated
 def low_rank_start(
-    basis: Annotated[Array, "n r"] | Annotated[Array, "f n r"],
-    base: Annotated[Array, "f n"],
+    basis: Annotated[ArrayInput, "n r"] | Annotated[ArrayInput, "f n r"],
+    base: Annotated[ArrayInput, "f n"],
 ) -> LowRank:
     """Start filters from prior means `base` (F, n) and the prior covariance S Sᵀ.
 
@@ -219,7 +222,7 @@ def low_rank_predict(
     state: LowRank,
     transition: Transition,
     *,
-    process: Annotated[Array, "state.size q"] | None = None,
+    process: Annotated[ArrayInput, "state.size q"] | None = None,
     dt: PositiveFloat | None = None,
 ) -> LowRank:
     r"""Predict the filters to the time of the next measurement.

@@ -21,6 +21,7 @@ from ..sensors import Sensor
 from ..validation import (
     ALLOW_NAN,
     Array,
+    ArrayInput,
     FrozenModel,
     Mask,
     PositiveDefinite,
@@ -30,11 +31,11 @@ from ..validation import (
 
 __all__ = ["FilterResult", "kalman_filter", "rts_smoother"]
 
-MeanVector = Annotated[Array, "... d"]
-SquareMatrix = Annotated[Array, "... d d"]
-ObservationMatrix = Annotated[Array, "... m d"]
+MeanVector = Annotated[ArrayInput, "... d"]
+SquareMatrix = Annotated[ArrayInput, "... d d"]
+ObservationMatrix = Annotated[ArrayInput, "... m d"]
 ObservationNoise = Annotated[PositiveDefinite, "... m m"]
-ObservationSeries = Annotated[Array, "... N m", ALLOW_NAN]
+ObservationSeries = Annotated[ArrayInput, "... N m", ALLOW_NAN]
 """Observations (T, ..., m) with NaN for missing components."""
 
 
@@ -199,7 +200,7 @@ def assimilate(
 def rts_smoother(
     run: FilterResult,
     *,
-    F: Annotated[Array, "... run.dim run.dim"],
+    F: Annotated[ArrayInput, "... run.dim run.dim"],
     Q: Annotated[PositiveSemidefinite, "... run.dim run.dim"],
 ) -> FilterResult:
     r"""Smooth a Kalman filter's run: states given all observations, by a backward recursion.

@@ -19,6 +19,7 @@ from ..models.quaternions import left_directions, rotate, rotation_vector_betwee
 from ..sensors import Sensor, stack
 from ..validation import (
     Array,
+    ArrayInput,
     FrozenModel,
     NonNegativeInt,
     PositiveDefinite,
@@ -111,12 +112,12 @@ class QuaternionChart(FrozenModel):
     @validated
     def project(
         self,
-        x: Annotated[Array, "... self.dim"],
-        cov: Annotated[Array, "... self.dim self.dim"],
+        x: Annotated[ArrayInput, "... self.dim"],
+        cov: Annotated[ArrayInput, "... self.dim self.dim"],
     ) -> Array:
         """Project covariances (..., d, d) of states to those of their errors, (..., k, k)."""
         projection = self.tangent_projection(x)
-        return projection @ cov @ projection.mT
+        return np.asarray(projection @ cov @ projection.mT)
 
     def tangent_projection(self, x: Array) -> Array:
         """Pseudo-inverse of the tangent basis, B⁺ = (Bᵀ B)⁻¹ Bᵀ, (..., k, d)."""
@@ -126,7 +127,7 @@ class QuaternionChart(FrozenModel):
 
 @validated
 def mekf(
-    mean: Annotated[Array, "... model.dim"],
+    mean: Annotated[ArrayInput, "... model.dim"],
     cov: Annotated[PositiveDefinite, "... chart.error_dim chart.error_dim"],
     observations: ObservationSeries,
     *,

@@ -22,6 +22,7 @@ from ..models import Model
 from ..sensors import Sensor, stack
 from ..validation import (
     Array,
+    ArrayInput,
     Mask,
     PositiveDefinite,
     PositiveSemidefinite,
@@ -44,7 +45,7 @@ from .linear import (
 
 __all__ = ["filterpy_ekf", "filterpy_kf", "filterpy_ukf"]
 
-StateMean = Annotated[Array, "... model.dim"]
+StateMean = Annotated[ArrayInput, "... model.dim"]
 StateCov = Annotated[PositiveDefinite, "... model.dim model.dim"]
 Step = Callable[[Any, int, Array, Mask], None]
 """``step(kf, k, observation, present)`` moves a filter of filterpy to step k."""

@@ -15,6 +15,7 @@ from ..derivatives import difference_with_error, evaluate_derivative
 from ..linalg import factor
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
     FrozenModel,
     NonNegativeFloat,
@@ -86,7 +87,7 @@ class Model(FrozenModel):
 
     @validated
     def step(
-        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat
+        self, x: Annotated[ArrayInput, "... self.dim"], t: float, dt: NonNegativeFloat
     ) -> Array:
         """Move states (..., d) from `t` to `t` + `dt`, without noise."""
         return call_batched(self, "transition", (x,), t, dt)
@@ -113,7 +114,7 @@ class Model(FrozenModel):
     @validated
     def sample_step(
         self,
-        x: Annotated[Array, "... self.dim"],
+        x: Annotated[ArrayInput, "... self.dim"],
         t: float,
         dt: NonNegativeFloat,
         *,
@@ -131,11 +132,11 @@ class Model(FrozenModel):
     @validated
     def jacobian(
         self,
-        x: Annotated[Array, "... self.dim"],
+        x: Annotated[ArrayInput, "... self.dim"],
         t: float,
         dt: NonNegativeFloat,
         *,
-        std: Annotated[Array, "... self.dim"] | None = None,
+        std: Annotated[ArrayInput, "... self.dim"] | None = None,
     ) -> Array:
         """Derivative of a step from states (..., d), as (..., d, d).
 
@@ -227,7 +228,7 @@ class LinearModel(Model):
 
     @validated
     def step(
-        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat
+        self, x: Annotated[ArrayInput, "... self.dim"], t: float, dt: NonNegativeFloat
     ) -> Array:
         """Move states (..., d) from `t` to `t` + `dt`, without noise."""
         if self.time_invariant:
@@ -280,11 +281,11 @@ class LinearModel(Model):
     @validated
     def jacobian(
         self,
-        x: Annotated[Array, "... self.dim"],
+        x: Annotated[ArrayInput, "... self.dim"],
         t: float,
         dt: NonNegativeFloat,
         *,
-        std: Annotated[Array, "... self.dim"] | None = None,
+        std: Annotated[ArrayInput, "... self.dim"] | None = None,
     ) -> Array:
         """Derivative of a step, the same matrix for all states, as (..., d, d)."""
         return np.full((*x.shape, self.dim), self.F(dt))
@@ -315,7 +316,7 @@ def _noise_of_step(model: LinearModel, dt: float) -> tuple[Array, Array]:
 @validated
 def simulate(
     model: Model,
-    x0: Annotated[Array, "... model.dim"],
+    x0: Annotated[ArrayInput, "... model.dim"],
     times: Times,
     *,
     rng: Rng,

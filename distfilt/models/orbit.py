@@ -13,7 +13,14 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveFloat, PositiveInt, validated
+from ..validation import (
+    Array,
+    ArrayInput,
+    Bounds,
+    PositiveFloat,
+    PositiveInt,
+    validated,
+)
 from .base import Model, NoiseStrength
 from .motion import count_steps, runge_kutta
 
@@ -51,8 +58,8 @@ def _check_outside(value: Array, name: str) -> None:
 
 _BOUNDED = Bounds(at_least=-1e75, at_most=1e75)
 """Up to this bound, squares of products of positions and velocities are finite."""
-Position = Annotated[Array, "... 3", _BOUNDED, _check_outside]
-Orbits = Annotated[Array, "... 6", _BOUNDED]
+Position = Annotated[ArrayInput, "... 3", _BOUNDED, _check_outside]
+Orbits = Annotated[ArrayInput, "... 6", _BOUNDED]
 
 
 @validated
@@ -118,7 +125,7 @@ def _rate(x: Array, t: float = 0.0) -> Array:
 
 @validated
 def propagate(
-    x: Annotated[Array, "... 6"],
+    x: Annotated[ArrayInput, "... 6"],
     dt: float,
     *,
     rule: Literal["dop853", "rk4"] = "dop853",
@@ -165,7 +172,7 @@ def propagate(
             x = runge_kutta(_rate, x, 0.0, h) if rule == "rk4" else _dop853(x, h)
             # Checked in each step: an orbit through the Earth may end outside it again.
             _check_outside(x[..., :3], "x")
-    return x
+    return np.asarray(x)
 
 
 def _dop853(x: Array, h: float) -> Array:

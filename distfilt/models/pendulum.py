@@ -12,7 +12,14 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..validation import Array, Bounds, NonNegativeFloat, PositiveFloat, validated
+from ..validation import (
+    Array,
+    ArrayInput,
+    Bounds,
+    NonNegativeFloat,
+    PositiveFloat,
+    validated,
+)
 from .base import Model
 from .motion import integrate
 
@@ -27,7 +34,7 @@ __all__ = [
 Length = Annotated[float, Bounds(at_least=1e-100, at_most=1e100)]
 """A length whose square neither underflows nor overflows."""
 Form = Literal["printed", "multiplier"]
-States = Annotated[Array, "... 4"]
+States = Annotated[ArrayInput, "... 4"]
 
 
 @validated
@@ -165,7 +172,9 @@ def _angle_rate(chart: Array, t: float, ratio: float) -> Array:
 
 
 @validated
-def pendulum_states(chart: Annotated[Array, "... 2"], *, length: Length = 1.0) -> Array:
+def pendulum_states(
+    chart: Annotated[ArrayInput, "... 2"], *, length: Length = 1.0
+) -> Array:
     r"""Cartesian states (..., 4), position and velocity, of chart coordinates.
 
     Parameters

@@ -12,7 +12,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from ..validation import Array, validated
+from ..validation import (
+    Array,
+    ArrayInput,
+    validated,
+)
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -39,8 +43,8 @@ def _check_nonzero(value: Array, name: str) -> None:
         )
 
 
-Quaternion = Annotated[Array, "... 4", _check_nonzero]
-Vector = Annotated[Array, "... 3"]
+Quaternion = Annotated[ArrayInput, "... 4", _check_nonzero]
+Vector = Annotated[ArrayInput, "... 3"]
 
 
 @validated

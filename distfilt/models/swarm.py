@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
     FrozenModel,
     NonNegativeFloat,
@@ -27,7 +28,7 @@ from .base import trajectory
 
 __all__ = ["RotatingMixture", "Swarm", "rotating_swarm"]
 
-Positions = Annotated[Array, "... self.dim"]
+Positions = Annotated[ArrayInput, "... self.dim"]
 
 
 def _reflect(x: Array, low: Array, high: Array) -> Array:
@@ -248,14 +249,14 @@ class RotatingMixture(FrozenModel):
         return np.asarray(-0.5 * (difference**2).sum(axis=-1) / self.variance)
 
     @validated
-    def density(self, x: Annotated[Array, "... 2"], t: float) -> Array:
+    def density(self, x: Annotated[ArrayInput, "... 2"], t: float) -> Array:
         """Density f at positions (..., 2), normalised over the plane."""
         logs = self._log_kernels(x, self.means(t))
         normalisation = 2 * np.pi * self.variance
         return np.asarray(np.exp(logs).mean(axis=-1) / normalisation)
 
     @validated
-    def score(self, x: Annotated[Array, "... 2"], t: float) -> Array:
+    def score(self, x: Annotated[ArrayInput, "... 2"], t: float) -> Array:
         """Score ∇f/f at positions (..., 2); finite even where f itself underflows."""
         means = self.means(t)
         logs = self._log_kernels(x, means)

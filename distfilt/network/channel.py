@@ -12,8 +12,10 @@ import numpy as np
 
 from ..validation import (
     Array,
+    ArrayInput,
     Indices,
     Mask,
+    MaskInput,
     PositiveInt,
     skip_validation,
     validated,
@@ -35,9 +37,9 @@ _PERFECT = Faults()
 _BLOCK_SIZE = 2**15
 """Number of messages whose losses are drawn at a time."""
 
-_Values = Annotated[Array, "*self.runs self.graph.n_agents k"]
+_Values = Annotated[ArrayInput, "*self.runs self.graph.n_agents k"]
 
-PerAgent = Annotated[Array, "*channel.runs channel.graph.n_agents k"]
+PerAgent = Annotated[ArrayInput, "*channel.runs channel.graph.n_agents k"]
 """One vector for each agent of an argument named `channel`."""
 
 LossRule = Literal["mutual", "metropolis", "keep", "renormalise", "zero"]
@@ -205,14 +207,14 @@ class Channel:
             return self._mix_without_faults(values, weights, rounds)
         for values, _ in self._mix_rounds(values, weights, on_loss, rounds):
             pass
-        return values
+        return np.asarray(values)
 
     @validated
     def send_on_links(
         self,
-        values: Annotated[Array, "*self.runs self.graph.senders.size k"],
+        values: Annotated[ArrayInput, "*self.runs self.graph.senders.size k"],
         *,
-        links: Annotated[Mask, "self.graph.senders.size"] | None = None,
+        links: Annotated[MaskInput, "self.graph.senders.size"] | None = None,
         acknowledged: bool = False,
     ) -> Array:
         """Send a different payload along each link.

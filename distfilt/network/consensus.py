@@ -16,6 +16,7 @@ import numpy as np
 from ..linalg import SolverError
 from ..validation import (
     Array,
+    ArrayInput,
     FrozenModel,
     Indices,
     PositiveFloat,
@@ -205,7 +206,7 @@ def finite_time_consensus(values: PerAgent, channel: Channel) -> Array:
     for eigenvalue in _order_eigenvalues(graph):
         # The factor I - L/λ is an averaging step with the gain 1/λ.
         mixed = channel.mix(mixed, _laplacian_weights(graph, 1 / eigenvalue))
-    return mixed
+    return np.asarray(mixed)
 
 
 @lru_cache(maxsize=32)
@@ -328,7 +329,7 @@ def max_consensus(
     graph._check_connected()
     largest = values.copy()
     if graph.n_agents == 1:
-        return largest
+        return np.asarray(largest)
     # Links are ordered by receiver, and each agent of a connected graph has one or
     # more.
     row_starts = graph.links.indptr[:-1]
@@ -337,7 +338,7 @@ def max_consensus(
         # fmax passes over NaN, a lost message.
         received = np.fmax.reduceat(arrived, row_starts, axis=-2)
         largest = np.fmax(largest, received)
-    return largest
+    return np.asarray(largest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,7 +370,7 @@ class AdmmResult(FrozenModel):
 @validated
 def admm(
     local_solve: Callable[[Array, float], Array],
-    start: Annotated[Array, "channel.graph.n_agents k"],
+    start: Annotated[ArrayInput, "channel.graph.n_agents k"],
     channel: Channel,
     *,
     rho: PositiveFloat = 1.0,

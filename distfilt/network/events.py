@@ -89,4 +89,4 @@ def event_triggered(
         x = x + graph.incidence @ np.where(np.isnan(change), 0.0, change)
         # A smaller threshold in the next round, for convergence in the limit.
         threshold *= decay
-    return x
+    return np.asarray(x)

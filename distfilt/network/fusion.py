@@ -17,6 +17,7 @@ from ..gaussians.single import match_moments
 from ..linalg import cholesky, solve_lower, symmetrise
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
     Mask,
     NonNegativeFloat,
@@ -40,12 +41,12 @@ __all__ = [
 ]
 
 Gaussians = tuple[
-    Annotated[Array, "*channel.runs channel.graph.n_agents d"],
+    Annotated[ArrayInput, "*channel.runs channel.graph.n_agents d"],
     Annotated[
-        Array, "*channel.runs channel.graph.n_agents d d", check_positive_definite
+        ArrayInput, "*channel.runs channel.graph.n_agents d d", check_positive_definite
     ],
 ]
-Ensembles = Annotated[Array, "*channel.runs channel.graph.n_agents N d"]
+Ensembles = Annotated[ArrayInput, "*channel.runs channel.graph.n_agents N d"]
 Pair = tuple[Array, Array]
 """Means and covariances, or self-weights and link weights."""
 
@@ -275,7 +276,7 @@ def mean_pull(
     """
     pulled = ensembles.copy()
     if gain == 0:
-        return pulled
+        return np.asarray(pulled)
     _warn_if_unstable(channel.graph, gain)
     _warn_if_disconnected(channel, rounds)
     weights = _laplacian_weights(channel.graph, gain)
@@ -287,7 +288,7 @@ def mean_pull(
         factor = (self_weights - gain * include_self)[..., None, None]
         deviations = pulled - means[..., None, :]
         pulled = new_means[..., None, :] + factor * deviations
-    return pulled
+    return np.asarray(pulled)
 
 
 @fusion_rule("ensembles")
@@ -297,7 +298,7 @@ def intersect_ensembles(
     channel: Channel,
     *,
     rule: Rule = "min_determinant",
-    scale: Annotated[Array, "d", Bounds(above=0)] | None = None,
+    scale: Annotated[ArrayInput, "d", Bounds(above=0)] | None = None,
     rounds: PositiveInt = 1,
 ) -> Array:
     """Fuse sample means and covariances by covariance intersection, and move ensembles to them.

@@ -94,4 +94,4 @@ def gossip_consensus(
         present = averaged[..., ends, :]
         mean = 0.5 * (present + received)
         averaged[..., ends, :] = np.where(complete, mean, present)
-    return averaged
+    return np.asarray(averaged)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
     FrozenModel,
     Indices,
@@ -445,7 +446,7 @@ def complete(agents: PositiveInt) -> Graph:
 
 @validated
 def disk(
-    positions: Annotated[Array, "A p", Bounds(at_least=-1e150, at_most=1e150)],
+    positions: Annotated[ArrayInput, "A p", Bounds(at_least=-1e150, at_most=1e150)],
     radius: PositiveFloat,
 ) -> Graph:
     """Return the disk graph: links between agents within a distance, as radios of one range have.

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
     FrozenModel,
     PositiveFloat,
@@ -47,7 +48,7 @@ class PIState(FrozenModel):
 
 
 @validated
-def pi_start(estimate: Annotated[Array, "... A k"]) -> PIState:
+def pi_start(estimate: Annotated[ArrayInput, "... A k"]) -> PIState:
     """Return the state before the first step: initial estimates (*runs, A, k), integrals zero.
 
     >>> pi_start([[1.0], [3.0]]).estimate.shape

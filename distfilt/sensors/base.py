@@ -21,6 +21,7 @@ from ..linalg import broadcast_leading, factor
 from ..validation import (
     ALLOW_NAN,
     Array,
+    ArrayInput,
     FrozenModel,
     PositiveDefinite,
     PositiveFloat,
@@ -38,7 +39,9 @@ __all__ = ["Sensor", "wrap"]
 
 @validated
 def wrap(
-    angles: Annotated[Array, "...", ALLOW_NAN], *, period: PositiveFloat = 2 * np.pi
+    angles: Annotated[ArrayInput, "...", ALLOW_NAN],
+    *,
+    period: PositiveFloat = 2 * np.pi,
 ) -> Array:
     """Bring angles into [-period/2, period/2).
 
@@ -137,8 +140,8 @@ class Sensor(FrozenModel):
     @validated
     def predict(
         self,
-        x: Annotated[Array, "... d"],
-        previous: Annotated[Array, "... d"] | None = None,
+        x: Annotated[ArrayInput, "... d"],
+        previous: Annotated[ArrayInput, "... d"] | None = None,
     ) -> Array:
         """Return the observation without noise of states (..., d), as (..., m).
 
@@ -165,10 +168,10 @@ class Sensor(FrozenModel):
     @validated
     def observe(
         self,
-        x: Annotated[Array, "... d"],
+        x: Annotated[ArrayInput, "... d"],
         *,
         rng: Rng,
-        previous: Annotated[Array, "... d"] | None = None,
+        previous: Annotated[ArrayInput, "... d"] | None = None,
     ) -> Array:
         """Draw a noisy observation of each of the states (..., d), as (..., m)."""
         predicted = self.predict(x, previous)
@@ -179,8 +182,8 @@ class Sensor(FrozenModel):
     @validated
     def residual(
         self,
-        observed: Annotated[Array, "... self.dim", ALLOW_NAN],
-        predicted: Annotated[Array, "... self.dim", ALLOW_NAN],
+        observed: Annotated[ArrayInput, "... self.dim", ALLOW_NAN],
+        predicted: Annotated[ArrayInput, "... self.dim", ALLOW_NAN],
     ) -> Array:
         """Return observed minus predicted, (..., m), wrapped where the sensor wraps.
 
@@ -231,10 +234,10 @@ class Sensor(FrozenModel):
     @validated
     def jacobian(
         self,
-        x: Annotated[Array, "... d"],
-        previous: Annotated[Array, "... d"] | None = None,
+        x: Annotated[ArrayInput, "... d"],
+        previous: Annotated[ArrayInput, "... d"] | None = None,
         *,
-        std: Annotated[Array, "... d"] | None = None,
+        std: Annotated[ArrayInput, "... d"] | None = None,
     ) -> Array:
         """Return the derivative of h in the present states (..., d), as (..., m, d).
 

@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
     DistinctIndices,
     NonNegativeInt,
@@ -42,7 +43,7 @@ AngleDeviation = Annotated[float, Bounds(at_least=1e-150, at_most=np.pi)]
 Pair = Annotated[tuple[NonNegativeInt, NonNegativeInt], check_distinct]
 """Two different components."""
 
-Point = Annotated[Array, "2"]
+Point = Annotated[ArrayInput, "2"]
 """A place in the plane."""
 
 
@@ -144,7 +145,7 @@ def distance(
     indices: DistinctIndices,
     *,
     std: Deviation,
-    origin: Annotated[Array, "n"] | None = None,
+    origin: Annotated[ArrayInput, "n"] | None = None,
 ) -> Sensor:
     """Measure the distance of some components from a place, ``h(x) = |x[indices] - origin|``.
 

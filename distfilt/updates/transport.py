@@ -142,8 +142,8 @@ def principal_components(
     n_state : int
         Number :math:`q_x` of the state's directions that are updated, at most d.
     n_observed : int
-        Number :math:`q_y` of the observations' directions that are used; all of them if there are
-        fewer observations.
+        Number :math:`q_y` of the observations' directions that are used: the principal ones of the
+        predictions with their drawn noise. All of them if there are fewer observations.
     complement : {"keep", "literal"}
         Treatment of the state outside the leading directions. ``"keep"`` leaves it unchanged.
         ``"literal"`` is line 8 as printed, which sets it to zero, with the mean.

@@ -144,7 +144,7 @@ def test_the_gate_of_a_mixture_has_the_spread_of_a_curved_sensor() -> None:
 
 
 def test_principal_directions_of_observations_are_those_with_noise() -> None:
-    """The first prediction spreads most, but with its noise the second: it alone is used."""
+    """The first prediction spreads most; with its noise the second does, and it alone is used."""
     rng = np.random.default_rng(0)
     x = rng.standard_normal((4000, 2)) * [2.0, 1.0]
     noise = np.diag([0.01, 100.0])
