@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from .validation import Array, call_user
+from .validation import Array, Mask, call_user
 from .validation.first_use import is_first_use
 
 __all__: list[str] = []
@@ -48,10 +48,10 @@ class _Differences:
     precision: Array
     # Where the function bends within the step but not within a shorter one, (..., d, m): that
     # is curvature. Noise looks bent over any step.
-    has_curvature: Array | bool = False
+    has_curvature: Mask | bool = False
 
     @property
-    def is_bent(self) -> Array:
+    def is_bent(self) -> Mask:
         """Whether the function bends within the step, beyond rounding, (..., d, m)."""
         # In single precision the bend may be rounding alone.
         unit = np.maximum(1e-9, 8 * self.precision)
@@ -214,21 +214,22 @@ def _precision(*values: Array) -> Array:
     Numbers that are exact in single precision were computed in it: after a step of 6e-6 in
     double precision none would be.
     """
-    is_single = True
+    is_single = np.ones(values[0].shape[-1], dtype=bool)
     with np.errstate(over="ignore", invalid="ignore", under="ignore"):
         for value in values:
             rows = value.reshape(-1, value.shape[-1])
             is_exact = (rows.astype(np.float32) == rows) | np.isnan(rows)
             is_single = is_single & is_exact.all(axis=0)
     single = np.finfo(np.float32).eps
-    return np.where(is_single, single, np.finfo(np.float64).eps)
+    return np.asarray(np.where(is_single, single, np.finfo(np.float64).eps))
 
 
 def _noise(differences: _Differences, x: Array, slope: Array) -> Array:
     """Return the noise of the function's values by rounding, (..., 1, m)."""
     # The values' own rounding ε|f|, and that of the states within the function, ε|J x|.
     through_states = (np.abs(slope) * np.abs(x)[..., None]).max(axis=-2, keepdims=True)
-    return differences.precision * (np.abs(differences.centre) + through_states)
+    noise = differences.precision * (np.abs(differences.centre) + through_states)
+    return np.asarray(noise)
 
 
 def _rounding_error(differences: _Differences, x: Array) -> Array:
@@ -319,9 +320,12 @@ def _try_differences(
 ) -> _Differences | None:
     """Return the differences over longer steps; None where the function does not reach so far."""
     # Beyond its domain a function may warn, return NaN, or raise.
-    with suppress(ArithmeticError, LookupError, RuntimeError, ValueError):
-        with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore"):
-            return _take_differences(function, x, difference, h)
+    with (
+        suppress(ArithmeticError, LookupError, RuntimeError, ValueError),
+        np.errstate(all="ignore"),
+        warnings.catch_warnings(action="ignore"),
+    ):
+        return _take_differences(function, x, difference, h)
     return None
 
 
@@ -334,7 +338,9 @@ def _noise_of_two_steps(short: _Differences, long: _Differences, x: Array) -> Ar
     steepest = np.maximum(np.abs(short.slope), np.abs(long.slope))
     rounding = _noise(short, x, steepest)
     bend = np.abs(short.bend)
-    is_noise = (np.abs(long.bend) < 64 * bend) & (bend < 1e-3 * np.abs(short.centre))
+    # What bends over every step, however short, is noise too.
+    is_small = bend < 1e-3 * np.abs(short.centre)
+    is_noise = (np.abs(long.bend) < 64 * bend) & (is_small | short.is_bent)
     is_noise &= ~np.asarray(short.has_curvature)
     # Slopes of the shortest step include the noise that is to be found.
     visible = np.where(is_noise, bend, 0.0).max(axis=-2, keepdims=True)
@@ -406,7 +412,9 @@ def _is_uncertain(slope: Array, error: Array, scale: Array, tolerance: Array) ->
     """Whether errors of slopes change predictions by a tenth of their row and of the noise."""
     weight = np.broadcast_to(scale, slope.shape[:-2] + slope.shape[-1:])[..., None, :]
     row = (np.abs(slope) * weight).max(axis=-1, keepdims=True)
-    limit = 0.1 * np.maximum(row, np.asarray(tolerance)[..., None])
+    allowed = np.asarray(tolerance)[..., None]
+    # A known constant has no deviation with which an error could be compared.
+    limit = np.where(allowed > 0, 0.1 * np.maximum(row, allowed), np.inf)
     return bool((error * weight > limit).any())
 
 
@@ -429,7 +437,7 @@ def _contradicts(
 
 def _is_off(
     slope: Array, reference: Array, other: Array, error: Array, static: Array | float
-) -> Array:
+) -> Mask:
     """Whether entries differ from reliable differences by more than these may err."""
     row_size = np.abs(reference - static).max(axis=-1, keepdims=True)
     step_error = np.abs(reference - other).max(axis=-1, keepdims=True)

@@ -183,6 +183,21 @@ def solve_definite(matrix: Array, right: Array) -> Array:
     return np.asarray(np.linalg.solve(matrix, right))
 
 
+def solve_semidefinite(matrix: Array, right: Array) -> Array:
+    """Solve P X = B for covariances of which some components may be known constants.
+
+    A component without variance has zero rows in P and in B, and gets zeros in X.
+
+    >>> solve_semidefinite(np.diag([2.0, 0.0]), np.array([[4.0], [0.0]])).ravel()
+    array([2., 0.])
+    """
+    is_known = np.diagonal(matrix, axis1=-2, axis2=-1) == 0
+    if np.count_nonzero(is_known):
+        # A one on the diagonal takes the component out of the sums.
+        matrix = matrix + np.where(is_known[..., None], np.eye(matrix.shape[-1]), 0.0)
+    return np.asarray(np.linalg.solve(matrix, right))
+
+
 def _has_many_small_systems(matrix: Array, right: Array) -> bool:
     """Whether substitution in numpy is faster than a LAPACK call for each system."""
     m = right.shape[-2]

@@ -195,11 +195,6 @@ def test_solves_agree_with_numpy(seed: int, d: int, leading: tuple[int, ...]) ->
 
 
 def test_values_that_wrap_and_large_components() -> None:
-    slope = central_difference(
-        wrap, np.array([np.pi, 3.0]), lambda a, b: wrap(a - b)
-    )
+    slope = central_difference(wrap, np.array([np.pi, 3.0]), lambda a, b: wrap(a - b))
     assert np.abs(slope - np.eye(2)).max() < 1e-9
-    assert (
-        np.abs(central_difference(lambda x: 2 * x, np.array([1e9])) - 2).max()
-        < 1e-9
-    )
+    assert np.abs(central_difference(lambda x: 2 * x, np.array([1e9])) - 2).max() < 1e-9

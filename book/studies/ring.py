@@ -107,7 +107,7 @@ def relative_sensor(radius: float, agent: int | None = None) -> Sensor:
         2,
         lambda x: eye.predict(relative(x)),
         eye.noise_cov,
-        residual_function=eye.residual_function,
+        periods=eye.periods,
         derivative=slope,
     )
 

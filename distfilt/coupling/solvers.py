@@ -198,9 +198,7 @@ def _normalize_masses(
     return rows / rows.sum(), column_masses
 
 
-def scale_cost(
-    cost: Array, limit: float | None = None
-) -> tuple[Array, float, float]:
+def scale_cost(cost: Array, limit: float | None = None) -> tuple[Array, float, float]:
     """Return the cost between zero and one, its minimum and its range.
 
     With a limit the range is up to there, and larger costs remain larger than one.

@@ -76,17 +76,42 @@ def normalize_weights(
         raise ValueError(
             "log_weights must be numbers below infinity, got NaN or infinity"
         )
-    # Logarithms of normalised weights are negative: these are weights by mistake.
-    nonnegative = logs.shape[-1] > 2 and logs.min() >= 0
-    if nonnegative and np.allclose(logs.sum(axis=-1), 1):
-        warnings.warn(
-            "log_weights must be logarithms, got numbers with a sum of 1",
-            RuntimeWarning,
-            stacklevel=4,
-        )
+    # Logarithms of weights, or of likelihoods, are negative as a rule.
+    if logs.size and logs.max() > 0:
+        _warn_of_likelihoods(logs)
     # The largest weight is one, so that none overflows.
     weights = np.exp(logs - largest)
     return np.asarray(weights / weights.sum(axis=-1, keepdims=True))
+
+
+def _warn_of_likelihoods(logs: Array) -> None:
+    """Warn if log-weights look like weights or likelihoods: not negative, and small beside one.
+
+    Logarithms of high densities are positive too, but then most are near the largest one.
+
+    >>> with warnings.catch_warnings(action="error"):
+    ...     _warn_of_likelihoods(np.array([21.0, 17.5, 20.3, 19.9]))
+    ...     _warn_of_likelihoods(np.array([0.9, 0.0001, 0.02, 0.03]))
+    Traceback (most recent call last):
+    RuntimeWarning: log_weights must be logarithms, got numbers from 0.0001 to 0.9, ...
+    """
+    rows = logs.reshape(-1, logs.shape[-1])
+    least = rows.min(axis=-1)
+    largest = rows.max(axis=-1)
+    # Equal numbers are the same weights either way.
+    is_suspect = (least >= 0) & (largest > least)
+    if not is_suspect.any():
+        return
+    is_suspect &= (largest <= 1) | (np.median(rows, axis=-1) < 0.1 * largest)
+    if not is_suspect.any():
+        return
+    k = int(is_suspect.argmax())
+    warnings.warn(
+        f"log_weights must be logarithms, got numbers from {least[k]:g} to {largest[k]:g}, as "
+        "likelihoods or weights are: take np.log of them",
+        RuntimeWarning,
+        stacklevel=5,
+    )
 
 
 @lru_cache(maxsize=8)
@@ -119,7 +144,7 @@ def transport_plans(ensemble: SquarableEnsemble, log_weights: ArrayLike) -> Arra
         Row i is the distribution of member i's mass; the cost is the squared distance. If several
         plans are optimal, as with copies of a member, a fixed addition of at most 1e-7 of the
         largest cost makes the choice. Where members are far from most others it is at most 1e-7
-        of each cost and of the typical one.
+        of the lower quartile of the costs.
 
     Examples
     --------
@@ -172,22 +197,47 @@ def _has_far_members(scaled_cost: Array) -> bool:
 def _couple_far_members(costs: Array, weights: Array, solve: Solve) -> Array:
     """Return the coupling of the weights to equal masses where some members are far away.
 
-    Costs are in units of what has to be moved, and ties are broken by a part of each cost, which
-    is not above the distances of near members.
+    Ties are broken by a part of the typical cost, which is not above the distances of near
+    members.
     """
     n = weights.size
     equal = np.full(n, 1 / n)
     rows = np.flatnonzero(weights > _NO_MASS)
     # A constant in a column does not change the plan: far members differ in the rest only.
     needed = costs[rows] - costs[rows].min(axis=0)
-    is_apart = needed > 1e-28 * needed.max()
-    typical = np.median(needed[is_apart]) if is_apart.any() else 0.0
-    needed = needed + _tie_breaker(n)[rows] * (needed + typical)
+    is_apart = costs > 1e-28 * costs.max()
+    typical = float(np.quantile(costs[is_apart], 0.25))
+    needed = needed + _tie_breaker(n)[rows] * typical
     mass = weights[rows].sum()
-    part, _ = solve(scale_cost(needed)[0], weights[rows] / mass, equal)
+    part = _solve_in_stages(needed, weights[rows] / mass, equal, typical, solve)
     # What hardly has any weight goes everywhere alike, so that the masses stay exact.
     plan = np.outer(weights, equal)
     plan[rows] = mass * part
+    return plan
+
+
+def _solve_in_stages(
+    cost: Array, a: Array, b: Array, typical: float, solve: Solve
+) -> Array:
+    """Solve for costs that differ by many powers of ten, the large differences first.
+
+    The potentials of one stage are taken off the cost, which does not change the plan. What is
+    left is small where the plan has mass, and is cut above a limit for the next stage.
+    """
+    scaled_cost, minimum, scale = scale_cost(cost)
+    plan, potential = solve(scaled_cost, a, b)
+    g = minimum + scale * potential
+    for limit in (1e6 * typical, 1e3 * typical):
+        # Reduced costs c_ij - f_i - g_j >= 0, with f_i = min_j (c_ij - g_j).
+        cost = cost - g
+        cost = cost - cost.min(axis=1, keepdims=True)
+        scaled_cost, minimum, scale = scale_cost(np.minimum(cost, limit))
+        trial, potential = solve(scaled_cost, a, b)
+        # Equal masses are so to rounding only; more mass above the limit is needed there.
+        if trial[cost > limit].sum() > 1e-12:
+            break
+        plan = trial
+        g = minimum + scale * potential
     return plan
 
 

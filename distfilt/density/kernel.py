@@ -183,7 +183,9 @@ def kernels(
 
     >>> grid = Grid((20, 20), high=[1000.0, 1.0])
     >>> z = kernels([[500.0, 0.5]], grid, bandwidth=[[80.0, 0.08]])
-    >>> bool(np.allclose(z * 1000, kernels([[0.5, 0.5]], Grid((20, 20)), bandwidth=0.08)))
+    >>> bool(
+    ...     np.allclose(z * 1000, kernels([[0.5, 0.5]], Grid((20, 20)), bandwidth=0.08))
+    ... )
     True
     """
     factors = _factors(positions, grid, bandwidth)
@@ -220,9 +222,7 @@ def kernel_density(
 
 
 @validated
-def kernel_constant(
-    grid: Grid, *, bandwidth: AxisWidths, agents: PositiveInt
-) -> float:
+def kernel_constant(grid: Grid, *, bandwidth: AxisWidths, agents: PositiveInt) -> float:
     r"""The constant k̄ of Zheng and Lin: ∫K²/(N hᵈ), for which Var p_KDE ≈ k̄ p.
 
     For a Gaussian, :math:`\bar k = 1/\bigl(N(2\sqrt\pi h)^d\bigr)`, with the product of the
@@ -351,12 +351,16 @@ def bandwidth(
     widest = np.maximum(silverman, least)
     if rule == "silverman":
         return widest if each_axis else float(widest)
+    # A narrower kernel than half the step of rounded positions would show the rounding.
+    step = _rounding_steps(positions, grid)
+    floor = 0.5 * (step[None] if each_axis else step.max())
     # From far below Silverman's bandwidth, for clusters, to above it.
     factors = np.geomspace(0.15, 1.5, 20)
+    least = np.maximum(least, floor)
     candidates = [np.maximum(silverman * factor, least) for factor in factors]
     if not each_axis:
         candidates = [float(h) for h in candidates]
-    spread_out = _undo_rounding(positions, grid)
+    spread_out = _undo_rounding(positions, grid, step)
     places = _number_places(spread_out, grid)
     scores = [_cross_validation_score(spread_out, grid, h, places) for h in candidates]
     return candidates[int(np.argmin(scores))]
@@ -372,23 +376,30 @@ def _number_places(x: Array, grid: Grid) -> Indices | None:
     return np.asarray(index.reshape(-1), dtype=np.intp)
 
 
-def _undo_rounding(x: Array, grid: Grid) -> Array:
-    """Spread agents (N, d) with ties on a lattice over its cells, evenly and without draws.
+def _rounding_steps(x: Array, grid: Grid) -> Array:
+    """Return the steps (d,) to which the positions of agents with ties are rounded, or zero."""
+    return np.array(
+        [_lattice_step(x[:, k], float(grid.width[k])) for k in range(grid.dim)]
+    )
+
+
+def _undo_rounding(x: Array, grid: Grid, step: Array) -> Array:
+    """Spread agents (N, d) over the intervals that were rounded, evenly and without draws.
 
     >>> line = Grid((9,), high=9.0)
-    >>> _undo_rounding(np.array([[3.0], [3.0], [4.0], [7.0]]), line).round(2).ravel()
-    array([2.81, 3.43, 4.04, 6.66])
+    >>> x = np.array([[3.0], [3.0], [4.0], [7.0]])
+    >>> _undo_rounding(x, line, np.array([1.0])).round(2).ravel()
+    array([3.43, 3.05, 3.66, 7.28])
     """
-    steps = [_lattice_step(x[:, k], grid.width[k]) for k in range(grid.dim)]
-    if not any(steps):
+    if not step.any():
         return x
     # Multiples of irrational numbers, taken modulo one, fill the unit interval evenly; agents in
     # one place are next to each other in this order.
     ratios = np.array([0.6180339887, 0.7548776662, 0.8191725134])[: grid.dim]
     ranks = np.empty(len(x))
     ranks[np.lexsort(x.T)] = np.arange(len(x))
-    offsets = ((0.5 + ranks[:, None] + 1) * ratios) % 1 - 0.5
-    moved = x + offsets * np.array(steps)
+    offsets = ((ranks[:, None] + 1.5) * ratios) % 1 - 0.5
+    moved = x + offsets * step
     # Reflected at the walls, as the kernels are.
     moved = grid.low + np.abs(moved - grid.low)
     high = grid.low + grid.width

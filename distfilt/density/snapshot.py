@@ -20,7 +20,7 @@ from ..validation import (
     PositiveFloat,
 )
 from .grid import Grid
-from .kernel import kernel_constant, kernels
+from .kernel import AxisWidths, kernel_constant, kernels
 
 __all__ = ["SwarmSnapshot", "remove_absent"]
 
@@ -35,8 +35,8 @@ class SwarmSnapshot(FrozenModel):
         Of agents inside the box; a row of NaN is an absent agent. At least one is present.
     grid : Grid
         Grid of the estimated density.
-    bandwidth : float
-        Bandwidth of every agent's kernel.
+    bandwidth : float or ndarray, (1, d)
+        Bandwidth of every agent's kernel, for all axes or for each.
     t : float
         The time, in s.
     local : tuple of int, optional
@@ -51,7 +51,7 @@ class SwarmSnapshot(FrozenModel):
 
     positions: Annotated[Array, "A grid.dim", ALLOW_NAN]
     grid: Grid
-    bandwidth: PositiveFloat
+    bandwidth: AxisWidths
     t: float
     local: DistinctIndices | None = None
 

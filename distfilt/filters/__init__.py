@@ -17,6 +17,7 @@ from .options import (
     FusesBeliefs,
     IsolatesRuns,
     KeepsPast,
+    ScoresObservations,
     SharesObservations,
 )
 from .particle import ParticleFilter
@@ -43,6 +44,7 @@ __all__ = [
     "ParticleCollapse",
     "ParticleFilter",
     "Observation",
+    "ScoresObservations",
     "SensorFilter",
     "SensorState",
     "SharesObservations",

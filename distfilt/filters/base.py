@@ -29,21 +29,27 @@ from ..models import Model
 from ..network import Channel, Faults, Ledger
 from ..network.channel import kind_of_rule
 from ..network.graphs import Graph, as_graph
-from ..sensors import Sensor
+from ..periods import Periods
+from ..sensors import LikelihoodSensor, Sensor
 from ..validation import (
     Array,
     Bounds,
     FrozenModel,
     InvalidArgumentError,
     Rng,
+    format_number,
     skip_validation,
     validated,
 )
+from ..validation.clocks import warn_of_clock
+from .bridge import insert_times
 from .failures import RECOVERABLE, FilterError, is_argument_error
 from .observations import Observation, match_delayed, read_observations
-from .plans import TimesArgument, plan_steps
+from .plans import TimesArgument, find_degrees, plan_steps
 from .priors import Prior
+from .repetition import drop_repeated
 from .record import SCORES, Score, Summary, Truth, final_state, record_run
+from .resets import Reset, read_reset
 from .states import SensorState, State
 from .step import Step
 
@@ -118,6 +124,13 @@ class Filter(FrozenModel, ABC, Generic[S]):
     def check_parts(self) -> None:
         """Refuse options that do not fit each other; families extend it."""
 
+    def insert_time(self, state: S, t: float) -> S:
+        """Return the state with a belief about a time between two that it keeps."""
+        raise ValueError(
+            f"delayed must be of a time that a {type(self).__name__} has stepped to, got "
+            f"{format_number(t)}"
+        )
+
     # The behaviour of a family without the option. A class of `options` makes a field of it.
 
     @cached_property
@@ -146,6 +159,11 @@ class Filter(FrozenModel, ABC, Generic[S]):
         return None
 
     @cached_property
+    def record_evidence(self) -> bool:
+        """Whether states have the log-likelihood and the NIS of their observations."""
+        return False
+
+    @cached_property
     def exchange_interval(self) -> float | None:
         """Seconds between two exchanges; None if agents exchange in every step."""
         return None
@@ -160,6 +178,11 @@ class Filter(FrozenModel, ABC, Generic[S]):
         return number > math.floor(t_before / self.exchange_interval + tolerance)
 
     # The parts that a family supplies.
+
+    @property
+    def periods(self) -> Periods:
+        """The period of each component of the state, None for those not circular; () if none."""
+        return ()
 
     @property
     @abstractmethod
@@ -219,8 +242,9 @@ class Filter(FrozenModel, ABC, Generic[S]):
             A Gaussian's ``(mean, cov)``, (d,) and (d, d); a frozen distribution of scipy; a
             mixture; members (N, d), or (*runs, A, N, d); or a function
             ``prior(members, rng=rng, leading=leading)`` that draws (*leading, N, d). A family
-            refuses kinds that it cannot use. One whose agents' states differ takes a list with a
-            prior for each agent.
+            refuses kinds that it cannot use. A list of any of these has a prior for each agent,
+            in families whose agents have beliefs of their own: all but
+            :class:`~distfilt.filters.TransportFilter`.
         rng : numpy.random.Generator, optional
             Draws the prior. All later steps draw from a child stream of it, which is independent
             of whatever else is drawn from it. Filters that draw nothing need none.
@@ -269,7 +293,8 @@ class Filter(FrozenModel, ABC, Generic[S]):
             NaN marks a missing component, run by run.
         delayed : sequence of Observation
             Observations of earlier times that arrive now; the filter needs a `lag` that reaches
-            back to them.
+            back to them. A time between two steps is inserted among those that the state keeps,
+            and counts as one of them: exactly for a linear model, to first order for others.
 
         Raises
         ------
@@ -282,7 +307,9 @@ class Filter(FrozenModel, ABC, Generic[S]):
         self.check_state(state)
         if t < state.t:
             Bounds(at_least=state.t)(t, "t")
-        return self._advance(state, t, observations, delayed)
+        if state.t == 0:
+            warn_of_clock(0.0, np.array([t]), "t")
+        return self._advance(state, t, observations, delayed, is_single=True)
 
     def _advance(
         self,
@@ -292,14 +319,38 @@ class Filter(FrozenModel, ABC, Generic[S]):
         delayed: Sequence[Observation],
         *,
         reuse_rng: bool = False,
+        is_single: bool = False,
     ) -> S:
-        """Take one step from checked arguments."""
+        """Take one step from checked arguments; a single one is not part of a planned run."""
         # A state of agents with sensors knows its runs from their failures.
         runs = state.failed.shape if isinstance(state, SensorState) else state.runs
         read = self.read_observations(observations, runs, t)
-        matched = match_delayed(cast(Any, self), delayed, state, t) if delayed else ()
+        matched: Sequence[Observation] = ()
+        if delayed:
+            moved = insert_times(self, delayed, state, t, reuse_rng=reuse_rng)
+            # The generator of a state that was made here is not the user's.
+            reuse_rng = reuse_rng or moved is not state
+            state = moved
+            matched = match_delayed(cast(Any, self), delayed, state, t)
+        repeated: list[Observation] = []
+        # Mostly each agent has one observation, of a new time: then none has come before.
+        has_sensors = isinstance(state, SensorState)
+        may_repeat = bool(matched) or t == state.t
+        if has_sensors and (may_repeat or any(len(entries) > 1 for entries in read)):
+            read, matched, repeated = drop_repeated(
+                read, matched, cast(Any, state).assimilated, cast(Any, self).model.dim
+            )
         # From here on all inputs are checked, and the family's own method does the rest.
         step = Step(self, state, t, read, matched, reuse_rng=reuse_rng)
+        if repeated:
+            step.warn_once("repeated", _describe_repetition(repeated[0]))
+        if is_single and has_sensors:
+            # Angles below four turns need no closer look.
+            observed = [o for entries in (*read, matched) for o in entries]
+            large = [o for o in observed if (abs(o.value) > 25).any()]
+            wild = find_degrees(cast(Any, self), large) if large else None
+            if wild is not None:
+                step.warn_once("degrees", wild)
         try:
             return self.next_state(step)
         except RECOVERABLE as error:
@@ -348,7 +399,8 @@ class Filter(FrozenModel, ABC, Generic[S]):
             arrival = observation.arrival_time
             if arrival is None or arrival > last:
                 raise ValueError(
-                    f"delayed must have an arrival_time up to {last:g}, got {arrival}"
+                    f"delayed must have an arrival_time up to {format_number(last)}, "
+                    f"got {arrival}"
                 )
         # In order of arrival; those with the same arrival keep the user's order.
         waiting = sorted(delayed, key=_arrival_time)
@@ -395,7 +447,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
             Which of them; CRPS costs about as much as an ensemble filter.
         delayed : sequence of Observation
             Each is assimilated at the first of `times` not before its `arrival_time`. Its own time
-            has to be one of `times`, also if the other observations are events.
+            may lie between two of them.
 
         Returns
         -------
@@ -406,7 +458,9 @@ class Filter(FrozenModel, ABC, Generic[S]):
             ``total_squared_error`` add components up, whatever their units, and say so; ``nees``
             is d on average for a consistent filter. ``messages``, ``scalars``, ``bytes``, ``lost``
             and ``rounds`` are those of each step, the same names with ``_total`` their sums;
-            ``rejected`` counts the observations that the gate rejects.
+            ``unseen`` counts the observations that an agent cannot use, since its sensor cannot
+            see from its belief; ``rejected`` counts those that the gate rejects; with `record_evidence`
+            ``log_likelihood``, ``nis`` and ``n_observed`` score them all.
             :func:`distfilt.filters.final_state` returns the state at the end.
         """
         return self._record(state, times, observations, truth, scores, delayed, 0)
@@ -486,16 +540,18 @@ class SensorFilter(Filter[S]):
     gate_probability: Annotated[float, Bounds(above=0, below=1)] | None = None
 
     supports_increments: ClassVar[bool] = False
+    supports_likelihoods: ClassVar[bool] = False
 
     def check_parts(self) -> None:
         """Refuse sensors or a graph that this family cannot use."""
         super().check_parts()
-        if not self.supports_increments and any(
-            sensor.uses_previous for agent in self.agent_sensors for sensor in agent
-        ):
+        if not self.supports_increments and self.change_sources:
             raise ValueError(
                 "sensors must not be increments here: this filter keeps no previous state"
             )
+        for sensors in self.agent_sensors:
+            for sensor in sensors:
+                self.check_likelihood(sensor)
         if self.graph is None:
             exchanges = self.share_observations or self.fusion is not None
             if exchanges and self.n_agents > 1:
@@ -506,11 +562,45 @@ class SensorFilter(Filter[S]):
             # A fixed graph is converted once.
             graph = as_graph(self.graph, self.n_agents, self.names)
             object.__setattr__(self, "graph", graph)
-        has_interval = self.exchange_interval is not None
-        if has_interval and self.sends_observations and not self.lag:
+        if self.exchange_interval is not None and self.sends_observations:
+            self._check_waiting()
+
+    def check_likelihood(self, sensor: Sensor) -> None:
+        """Refuse a sensor that is a likelihood, where the noise is taken as Gaussian."""
+        if not isinstance(sensor, LikelihoodSensor):
+            return
+        if not self.supports_likelihoods:
+            raise ValueError(
+                "sensors must have Gaussian noise here, got a LikelihoodSensor: use a "
+                f"ParticleFilter or a TransportFilter in place of a {type(self).__name__}"
+            )
+        if self.gate_probability is not None and sensor.moments is None:
+            raise ValueError(
+                "sensors must be LikelihoodSensors with moments for a gate, got moments of None"
+            )
+
+    def _check_waiting(self) -> None:
+        """Refuse a filter whose observations wait for an exchange and cannot be used then."""
+        if not self.lag:
             raise ValueError(
                 "lag must be at least 1 for observations that wait for an exchange, got 0"
             )
+        if self.change_sources:
+            raise ValueError(
+                "sensors must not be increments where observations wait for an exchange: "
+                "use share_observations=False or no exchange_interval"
+            )
+
+    @cached_property
+    def periods(self) -> Periods:
+        """The model's periods."""
+        return cast(Periods, self.model.periods)
+
+    @cached_property
+    def notices_wrapping(self) -> bool:
+        """Whether angles are observed, but none is declared: then a wrapping model is noticed."""
+        observes = any(s.wraps for sensors in self.agent_sensors for s in sensors)
+        return observes and not self.periods
 
     @cached_property
     def n_agents(self) -> int:
@@ -532,6 +622,16 @@ class SensorFilter(Filter[S]):
         return tuple(result)
 
     @cached_property
+    def change_sources(self) -> tuple[tuple[int, int], ...]:
+        """The agents and numbers of all sensors of changes."""
+        sources = []
+        for agent, sensors in enumerate(self.agent_sensors):
+            for number, sensor in enumerate(sensors):
+                if sensor.uses_previous:
+                    sources.append((agent, number))
+        return tuple(sources)
+
+    @cached_property
     def observation_sizes(self) -> tuple[int | None, ...]:
         """Size m of each agent's observation; None without a sensor, and with several."""
         return tuple([s[0].dim if len(s) == 1 else None for s in self.agent_sensors])
@@ -549,6 +649,73 @@ class SensorFilter(Filter[S]):
         names = tuple(model.names) or tuple(str(k) for k in range(model.dim))
         return names, tuple(model.units) or ("",) * model.dim
 
+    @validated
+    def reset(
+        self,
+        state: S,
+        components: Sequence[int | str],
+        value: Any,
+        cov: Any,
+        *,
+        agents: Sequence[int] | None = None,
+    ) -> S:
+        """Return the state with a new belief about some components, and all others as they are.
+
+        For a landmark that is seen for the first time, a bias that begins, or a sensor that has
+        been restarted: the components become ``value(x) + e`` with e ~ N(0, `cov`). Beliefs about
+        earlier times keep the former components. Exact for linear functions; a Gaussian filter
+        uses the derivative at its mean.
+
+        Parameters
+        ----------
+        state : State
+            The state; it is not changed.
+        components : sequence of int or str
+            The k components, by index or by the model's names.
+        value : array_like, (k,), or callable
+            Their new mean; or a function of the whole state, (..., d) to (..., k), such as the
+            place of a landmark, from the robot's pose and what it observed.
+        cov : array_like, (k, k)
+            Covariance of e, positive semidefinite.
+        agents : sequence of int, optional
+            The agents whose beliefs change; all by default.
+
+        Examples
+        --------
+        A robot at x on a line, which it knows to 2, sees a landmark 5 ahead, to 0.1:
+
+        >>> import numpy as np
+        >>> from distfilt.filters import GaussianFilter
+        >>> from distfilt.models import Model
+        >>> from distfilt.sensors import component
+        >>> still = Model(
+        ...     2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)), names=("robot", "landmark")
+        ... )
+        >>> f = GaussianFilter(still, [component([0], std=1.0)])
+        >>> state = f.start(([3.0, 0.0], np.diag([4.0, 1e6])))
+        >>> state = f.reset(state, ["landmark"], lambda x: x[..., :1] + 5.0, [[0.01]])
+        >>> state.means[0], state.covariances[0].round(2)
+        (array([3., 8.]), array([[4.  , 4.  ],
+               [4.  , 4.01]]))
+
+        The landmark has been moved, nobody knows where to:
+
+        >>> f.reset(state, ["landmark"], [0.0], [[1e6]]).covariances[0].round(2)
+        array([[4.e+00, 0.e+00],
+               [0.e+00, 1.e+06]])
+        """
+        self.check_state(state)
+        names, _ = self.components
+        return self.reset_belief(
+            state, read_reset(components, value, cov, agents, names, self.n_agents)
+        )
+
+    def reset_belief(self, state: S, reset: Reset) -> S:
+        """Return the state with the new belief; a family that can do so extends it."""
+        raise ValueError(
+            f"state must be Gaussians or members to be reset, got a {type(state).__name__}"
+        )
+
     def channel(self, state: S, t: float) -> Channel | None:
         """Return the channel of the step to `t`; None where nobody can send."""
         graph = self.graph
@@ -563,9 +730,11 @@ class SensorFilter(Filter[S]):
         if not graph.senders.size:
             return None
         runs = state.failed.shape if isinstance(state, SensorState) else state.runs
-        return Channel.construct(
+        channel = Channel.construct(
             graph, ledger=state.ledger, runs=runs, faults=self.faults, t=t
         )
+        channel.periods = self.periods
+        return channel
 
     def read_observations(
         self, observations: Any, runs: tuple[int, ...], t: float
@@ -588,6 +757,17 @@ class SensorFilter(Filter[S]):
         return result
 
 
+def _describe_repetition(observation: Observation) -> str:
+    """Return the warning of an observation that has come twice."""
+    sensor = observation.sensor
+    name = f"{sensor.kind} sensor" if isinstance(sensor, Sensor) else f"sensor {sensor}"
+    return (
+        f"observations must differ to count each, got the same value of agent "
+        f"{observation.agent}'s {name} at t = {format_number(observation.t)} s twice: it "
+        "counts once; a second sensor has a number of its own"
+    )
+
+
 def _arrival_time(observation: Observation) -> float:
     return -np.inf if observation.arrival_time is None else observation.arrival_time
 
@@ -601,6 +781,11 @@ def _smooth_states(states: Iterable[Any], lag: int) -> Iterator[tuple[Any, Any]]
     recent: list[Any] = []
     for state in states:
         recent.append(state)
+        steps = [one.t for one in recent]
+        if any(time not in steps for time in state.times if time > steps[0]):
+            raise ValueError(
+                "delayed must be of one of the times for smoothing, got one between two of them"
+            )
         if len(recent) > lag:
             yield recent.pop(0), state.lagged_states[-lag]
     # Near the end fewer times follow.

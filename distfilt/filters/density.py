@@ -20,7 +20,7 @@ from ..density import (
     zero_mean_prior,
 )
 from ..density.consensus import estimate_without_messages
-from ..density.kernel import check_resolution
+from ..density.kernel import AxisWidths, check_resolution
 from ..density.snapshot import SwarmSnapshot, remove_absent
 from ..network import Channel, Graph
 from ..network.graphs import as_graph
@@ -34,6 +34,7 @@ from ..validation import (
     PositiveInt,
     call_user,
     check_array,
+    format_number,
 )
 from .observations import list_by_agent
 from .options import ExchangesAtIntervals
@@ -169,7 +170,7 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
     graph: PositiveFloat | Graph | Callable[[float, Array], Graph]
     _: KW_ONLY
     fusion: ConsensusProtocol = field()
-    bandwidth: PositiveFloat
+    bandwidth: AxisWidths
     local: DistinctIndices | None = None
     initial_density: (
         Literal["flat", "observed"] | Annotated[Array, "model.grid.size"]
@@ -296,7 +297,9 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
         t = step.t
         dt = step.dt
         if not dt:
-            raise ValueError(f"t must be above {state.t:g}, got {t:g}")
+            raise ValueError(
+                f"t must be above {format_number(state.t)}, got {format_number(t)}"
+            )
         # The graph depends on the positions, so the channel is made here.
         graph = self._graph_at(snapshot, state.t, t)
         channel = Channel(graph, ledger=state.ledger, faults=self.faults, t=t)

@@ -11,22 +11,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property, partial
 from inspect import signature
-from typing import Annotated, Any, ClassVar, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
 import numpy as np
 
 from .. import ensembles as moments
 from ..coupling import rejuvenate, transport_plans
 from ..coupling.transform import apply_plan, normalize_weights
-from ..linalg import center_ensemble, to_unit_variances
+from ..linalg import center_ensemble, log_sum_exp, to_unit_variances
 from ..models import Model
+from ..periods import check_transition, fold, fold_torn, settle, warn_of_wrapping
 from ..network import Graph, finite_time_consensus, intersect_ensembles
 from ..sensors import Sensor
 from ..updates import enkf, enkf_exact, stochastic_forecast, with_missing
 from ..updates.decorator import has_tag
 from ..updates.gaussian import exact_forecast
+from ..updates.wrappers import find_locate
 from ..updates.particles import (
     log_likelihood,
+    log_normalizer,
     size_of,
     warn_of_collapse,
     warn_of_weights,
@@ -37,19 +40,24 @@ from ..validation import (
     InvalidArgumentError,
     NonNegativeFloat,
     Rng,
+    all_finite,
     call_user,
     check_array,
+    format_number,
 )
 from .base import SensorFilter
+from .bridge import insert_members
 from .options import (
     ExchangesAtIntervals,
     FusesBeliefs,
     IsolatesRuns,
     KeepsPast,
+    ScoresObservations,
     SharesObservations,
 )
-from .priors import Prior, draw_members
+from .priors import Prior, draw_members, split_by_agent
 from .record import Summary
+from .resets import Reset, reset_members
 from .states import SensorState
 from .step import Received, Step, copy_rng
 
@@ -94,6 +102,7 @@ class MembersFilter(
     FusesBeliefs[MemberState],
     KeepsPast[MemberState],
     IsolatesRuns[MemberState],
+    ScoresObservations[MemberState],
 ):
     """The common part of all families whose agents hold members."""
 
@@ -116,9 +125,32 @@ class MembersFilter(
                 f"got {sizes}"
             )
 
+    def reset_belief(self, state: MemberState, reset: Reset) -> MemberState:
+        """Return the state with new draws of some components."""
+        rng = copy_rng(cast(Rng, state.rng))
+        new = reset_members(state, reset, self.draw_normal, rng)
+        return cast(MemberState, new)
+
+    def insert_time(self, state: MemberState, t: float) -> MemberState:
+        """Return the state with draws of a time between two that it keeps, given both."""
+        return cast(MemberState, insert_members(self, state, t))
+
+    def draw_normal(self, shape: tuple[int, ...], rng: Rng) -> Array:
+        """Draw standard normal numbers for members (*runs, A, N, d)."""
+        return rng.standard_normal(shape)
+
     def draw_prior(self, prior: Prior, leading: tuple[int, ...], rng: Rng) -> Array:
-        """Draw members (*leading, N, d) of a prior."""
-        return draw_members(prior, self.members, leading, self.model.dim, rng)
+        """Draw members (*leading, N, d) of a prior, or of each agent's."""
+        dim = self.model.dim
+        priors = split_by_agent(prior, dim, self.n_agents)
+        if priors is not None:
+            drawn = [self.draw_prior(one, leading[:-1], rng) for one in priors]
+            return np.stack(drawn, axis=-3)
+        members = draw_members(prior, self.members, leading, dim, rng)
+        # A Gaussian runs on, however wide it is; other members may be cut at ±period/2.
+        if type(prior) is tuple:
+            return members
+        return fold_torn(members, self.periods)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +191,7 @@ class EnsembleFilter(
     ----------
     model, sensors, graph, gate_probability, faults, names
         As for :class:`~distfilt.filters.SensorFilter`.
-    fusion, share_observations, lag, on_error, exchange_interval
+    fusion, share_observations, lag, on_error, exchange_interval, record_evidence
         As in :mod:`distfilt.filters.options`. The rule is a function
         ``fusion(ensembles, channel) -> ensembles``, such as ``partial(mean_pull, gain=0.05)``.
     update : callable
@@ -252,7 +284,8 @@ class EnsembleFilter(
         self, prior: Prior, runs: tuple[int, ...], rng: Any
     ) -> dict[str, Any]:
         """Draw members for each agent."""
-        return {"ensembles": self.draw_prior(prior, (*runs, self.n_agents), rng)}
+        members = self.draw_prior(prior, (*runs, self.n_agents), rng)
+        return {"ensembles": settle(members, self.periods)}
 
     def next_state(self, step: Step[EnsembleState]) -> EnsembleState:
         """Forecast, condition on the received observations, fuse."""
@@ -264,13 +297,20 @@ class EnsembleFilter(
                 self.forecast, ensembles, self.model, state.t, step.dt, rng=step.rng
             )
             _check_shape(ensembles, "forecast", state.ensembles.shape)
+            # A forecast of the user's own may wrap.
+            ensembles = fold_torn(ensembles, self.periods)
+            if self.notices_wrapping:
+                warn_of_wrapping(
+                    self.model, state.ensembles, ensembles, state.t, step.dt
+                )
         # The ensembles of the earlier times that are kept, and now.
         stack = step.stack(step.check_forecast(ensembles, state.ensembles))
         for place, group in step.received():
             self._condition(stack, place, group, step)
         # Agents exchange beliefs after the update, through the same channel.
-        (fused,) = step.fuse(stack[-1])
-        return step.end(ensembles=fused, past=regress_past(stack, fused))
+        fused = fuse_members(step, stack[-1])
+        past = [settle(x, self.periods) for x in regress_past(stack, fused)]
+        return step.end(ensembles=settle(fused, self.periods), past=past)
 
     def _condition(
         self, stack: list[Array], place: int, group: Received, step: Step[EnsembleState]
@@ -280,24 +320,41 @@ class EnsembleFilter(
         members = tuple([ensembles[..., rows, :, :] for ensembles in stack])
         # A delayed observation of the previous time has changed it in the stack.
         previous = step.before(place, group, stack[:-1])
-        predicted = group.predict(members[place], previous)
-        group = step.gate(group, sample_moments, predicted)
+        # An update by likelihoods compares every member with the observation by itself.
+        weights_members = has_tag(self.update, "weights_members")
+        branch: Literal["mean", "each"] = "each" if weights_members else "mean"
+        predicted = group.predict(members[place], previous, branch=branch)
+        if not np.isfinite(predicted).all():
+            is_unseen = np.isnan(predicted).any(axis=-2)
+            step.note_unseen(group, is_unseen, "some members cannot see")
+        group = step.gate(group, sample_moments, predicted, is_torn=weights_members)
+        if weights_members and self.periods:
+            logs = log_likelihood(predicted, group.target, group.noise)
+            weights = normalize_weights(logs)
+            members = tuple([fold(x, self.periods, weights) for x in members])
         # An update that predicts again needs the present members alone.
         predict = None
         if self._repredicts and len(stack) == 1:
-            predict = partial(group.predict, previous=previous)
+            predict = partial(group.predict, previous=previous, branch=branch)
+        located = self._locate_observations(group)
 
         def compute(h: Array, y: Array, *args: Any) -> tuple[Array, ...]:
-            *past, present, noise, rng = args
+            *arrays, noise, rng = args
+            # The places of the observations come behind the members of all times.
+            places = arrays.pop() if located else None
+            *past, present = arrays
             predict_again = predict if h.shape == predicted.shape else None
             # All times' members meet the same draws, so that the separate updates are one joint
             # update; the last of them advances the generator.
-            updated = [self._update(x, h, y, noise, copy_rng(rng), None) for x in past]
-            return (*updated, self._update(present, h, y, noise, rng, predict_again))
+            updated = [
+                self._update(x, h, y, noise, copy_rng(rng), None, places) for x in past
+            ]
+            new = self._update(present, h, y, noise, rng, predict_again, places)
+            return (*updated, new)
 
         results = step.apply(
             compute,
-            (predicted, group.target, *members),
+            (predicted, group.target, *members, *located),
             members,
             group.agents,
             shared=group.noise,
@@ -307,12 +364,51 @@ class EnsembleFilter(
         for ensembles, new in zip(stack, results, strict=True):
             ensembles[..., rows, :, :] = new
 
+    def _locate_observations(self, group: Received) -> tuple[Array, ...]:
+        """Return the places (*runs, G, M, k) of a group's observations, if the update needs them.
+
+        An update with one array of places fits agents that all receive the same observations.
+        """
+        if not has_tag(self.update, "locates"):
+            return ()
+        locate = find_locate(self.update)
+        if locate is None:
+            self._check_common_places(group)
+            return ()
+        places = group.collect(locate)
+        return (np.broadcast_to(places, (*group.target.shape, places.shape[-1])),)
+
+    def _check_common_places(self, group: Received) -> None:
+        """Refuse one array of places where agents, or steps, have different observations."""
+        received = [part.sensor for part in group.parts]
+        known = set(received)
+        is_common = group.has_same_sensors
+        for agent in group.agents.tolist():
+            own = set(self.agent_sensors[agent])
+            # Without one of the agent's own sensors another step has other observations.
+            is_common &= not (own & known) or own <= known
+        if not is_common:
+            raise ValueError(
+                "observation_places must be a mapping from each sensor to its place where "
+                "agents or steps have different observations, got an array"
+            )
+
     def _update(
-        self, x: Array, h: Array, y: Array, noise: Array, rng: Rng, predict: Any
+        self,
+        x: Array,
+        h: Array,
+        y: Array,
+        noise: Array,
+        rng: Rng,
+        predict: Any,
+        places: Array | None = None,
     ) -> Array:
         """Update ensembles (..., G, N, d); a plain function gets one agent's at a time."""
         if self._repredicts:
-            new = call_user(self.update, x, h, y, noise, rng=rng, predict=predict)
+            options = {} if places is None else {"observation_places": places}
+            new = call_user(
+                self.update, x, h, y, noise, rng=rng, predict=predict, **options
+            )
             return cast(Array, new)
         if self._stacks:
             new = with_missing(self.update, x, h, y, noise, rng=rng)
@@ -362,7 +458,7 @@ class TransportFilter(_EnsembleSummary):
     ----------
     model, sensors, graph, gate_probability, faults, names
         As for :class:`~distfilt.filters.SensorFilter`.
-    lag, on_error
+    lag, on_error, record_evidence
         As in :mod:`distfilt.filters.options`.
     fusion : callable
         ``fusion(log_likelihoods, channel) -> averages``, both (\*runs, A, N): exact finite-time
@@ -395,13 +491,19 @@ class TransportFilter(_EnsembleSummary):
     rejuvenation: NonNegativeFloat = 0.0
 
     belief_kind: ClassVar[str | None] = "vectors"
+    supports_likelihoods: ClassVar[bool] = True
 
     def initial_state(
         self, prior: Prior, runs: tuple[int, ...], rng: Any
     ) -> dict[str, Any]:
         """Draw one set of members, (N, d) or (*runs, 1, N, d), for all agents."""
+        if split_by_agent(prior, self.model.dim, self.n_agents) is not None:
+            raise ValueError(
+                "prior must be one for all agents of a TransportFilter, which have the same "
+                "members, got a list with one for each"
+            )
         # One draw, repeated for every agent.
-        common = self.draw_prior(prior, (*runs, 1), rng)
+        common = settle(self.draw_prior(prior, (*runs, 1), rng), self.periods)
         return {"ensembles": np.repeat(common, self.n_agents, axis=-3)}
 
     def next_state(self, step: Step[EnsembleState]) -> EnsembleState:
@@ -418,19 +520,45 @@ class TransportFilter(_EnsembleSummary):
         is_cut_off = self.n_agents > 1 and callable(self.graph) and step.channel is None
         if is_cut_off and any((*step.observations, step.delayed)):
             raise ValueError(
-                f"graph must have links for the observations of t = {step.t:g}, got none"
+                "graph must have links for the observations of t = "
+                f"{format_number(step.t)}, got none"
             )
         if step.dt:
+            if self.periods:
+                check_transition(self.model, members.mean(axis=-2), state.t, step.dt)
             sample_step = partial(self.model.sample_step, t=state.t, dt=step.dt)
             members = self._draw_in_common(sample_step, (members,), step.rng)
+            if self.notices_wrapping:
+                warn_of_wrapping(
+                    self.model, state.ensembles, members, state.t, step.dt
+                )
         stack = step.stack(step.check_forecast(members, state.ensembles))
         (logs,) = step.fuse(self._log_likelihoods(stack, step))
         if step.has_fusion:
             # The rule returns averages over the agents, and the joint likelihood is a sum.
             logs = self.n_agents * logs
+        if step.scores:
+            # log Σ p(y | xᵢ) / N: that of all agents' observations, if they agree on it.
+            total = log_sum_exp(logs)[..., 0] - np.log(self.members)
+            step.add_log_likelihood(total, slice(None))
         stack = self._transport(stack, logs, step)
         self._warn(logs, step)
+        stack = [settle(members, self.periods) for members in stack]
         return step.end(ensembles=stack[-1], past=stack[:-1])
+
+    def reset_belief(self, state: EnsembleState, reset: Reset) -> EnsembleState:
+        """Return the state with new draws of some components, the same for all agents."""
+        if len(reset.agents) < self.n_agents:
+            raise ValueError(
+                "agents must be all of a TransportFilter, which have the same members, got "
+                f"{reset.agents}"
+            )
+        return super().reset_belief(state, reset)
+
+    def draw_normal(self, shape: tuple[int, ...], rng: Rng) -> Array:
+        """Draw standard normal numbers, the same for all agents."""
+        *runs, _, n, d = shape
+        return rng.standard_normal((*runs, 1, n, d))
 
     def _draw_in_common(
         self, draw: Callable[..., Array], arrays: tuple[Array, ...], rng: Rng
@@ -449,10 +577,29 @@ class TransportFilter(_EnsembleSummary):
         for place, group in step.received():
             rows = group.rows
             previous = step.before(place, group, stack[:-1])
-            predicted = group.predict(stack[place][..., rows, :, :], previous)
-            group = step.gate(group, sample_moments, predicted)
+            members = stack[place][..., rows, :, :]
+            predicted = group.predict(members, previous, branch="each")
+            if not all_finite(predicted):
+                is_unseen = np.isnan(predicted).any(axis=-2)
+                step.note_unseen(group, is_unseen, "some members cannot see")
+            weighted = None
+            if group.likelihoods:
+                weighted = members, np.full(members.shape[:-1], 1 / self.members)
+            group = step.gate(
+                group,
+                sample_moments,
+                predicted,
+                is_torn=True,
+                is_gaussian=False,
+                weighted=weighted,
+            )
+            group, likelihoods = group.log_likelihood(members)
+            logs[..., rows, :] += likelihoods
             # Σ log p(y | xᵢ) over the observations that the agent has.
             logs[..., rows, :] += log_likelihood(predicted, group.target, group.noise)
+            if step.scores:
+                normalizer = log_normalizer(group.target, group.noise)
+                logs[..., rows, :] += normalizer[..., None]
             warn_of_weights(0 * predicted[..., 0], predicted, group.target, group.noise)
         return logs
 
@@ -460,6 +607,10 @@ class TransportFilter(_EnsembleSummary):
         self, stack: list[Array], logs: Array, step: Step[EnsembleState]
     ) -> list[Array]:
         """Move all times' members by the transport plan of the present ones."""
+        if self.periods:
+            # Costs and means need one branch: that about the weighted members' direction.
+            weights = normalize_weights(logs)
+            stack = [fold(members, self.periods, weights) for members in stack]
 
         def compute(logs: Array, *args: Any) -> tuple[Array, ...]:
             *times, _, _ = args
@@ -506,9 +657,25 @@ class TransportFilter(_EnsembleSummary):
         size = size_of(weights).min(initial=np.inf)
         if size < 1.1:
             warn_of_collapse(
-                f"t = {step.t:g} s: an agent's weights have an effective size of {size:.1f}",
+                f"t = {format_number(step.t)} s: an agent's weights have an effective size of "
+                f"{size:.1f}",
                 "rejuvenation=",
             )
+
+
+def fuse_members(step: Step[Any], members: Array) -> Array:
+    """Return members (*runs, A, N, d) after the fusion rule, if any, on the branch before it.
+
+    The rule gets all agents' members on one branch.
+    """
+    periods = step.filter.periods
+    if not periods or not step.has_fusion:
+        (fused,) = step.fuse(members)
+        return fused
+    means = members.mean(axis=-2)
+    shift = (fold(means, periods) - means)[..., None, :]
+    (fused,) = step.fuse(members + shift)
+    return fold_torn(fused, periods) - shift
 
 
 def regress_past(stack: list[Array], fused: Array) -> list[Array]:

@@ -7,14 +7,15 @@ each of them has. :func:`fuse_beliefs` applies the filter's fusion rule after th
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from ..network import Channel
 from ..sensors import Sensor
-from ..validation import Array, call_user, check_array
-from .observations import Observation
+from ..validation import Array, call_user, check_array, format_number
+from .changes import References
+from .observations import Observation, sensor_of
 
 if TYPE_CHECKING:
     from .step import Step
@@ -45,22 +46,38 @@ def collect_observations(step: Step[Any]) -> Known:
     if step.state.pending:
         sent_labels = [_label(step, of_agent) for of_agent in sent]
     by_time: Known = {}
+    if step.references is not None:
+        step.references.sources.clear()
     for agent, messages in enumerate(inbox):
         # In order of the senders, so that all agents with the same set have the same order.
         for sender in sorted((agent, *messages)):
             if sender == agent:
                 times_and_sensors = own_labels[agent]
+                listed = observed[agent]
                 values = [observation.value for observation in observed[agent]]
             else:
                 times_and_sensors = sent_labels[sender]
+                listed = sent[sender]
                 payload = messages[sender]
                 values = list(payload) if type(payload) is tuple else [payload]
+            if step.references is not None:
+                _receive_changes(step, agent, listed)
             # The part behind the values counts as communication alone.
             for (t, sensor), value in zip(times_and_sensors, values, strict=False):
                 if t not in by_time:
                     by_time[t] = [[] for _ in observed]
                 by_time[t][agent].append((sensor, value))
     return by_time
+
+
+def _receive_changes(
+    step: Step[Any], agent: int, observations: list[Observation]
+) -> None:
+    """Note which sensors' present observations an agent has, in their order."""
+    references = cast(References, step.references)
+    for observation in observations:
+        if observation.t == step.t:
+            references.receive(agent, observation)
 
 
 def _choose_outgoing(
@@ -76,6 +93,7 @@ def _choose_outgoing(
     waiting: tuple[Observation, ...] = step.state.pending
     if step.channel is None:
         if f.lag:
+            _refuse_waiting_changes(step, observed)
             # Copies, since the user's array may change before it is sent.
             new = [
                 observation.replace(value=observation.value.copy())
@@ -89,11 +107,26 @@ def _choose_outgoing(
     for observation in waiting:
         if observation.t not in step.times:
             raise ValueError(
-                f"lag must reach back to t = {observation.t:g}, the time of an observation "
-                f"that is sent at the contact at t = {step.t:g}, got {f.lag}"
+                f"lag must reach back to t = {format_number(observation.t)}, the time of an "
+                f"observation that is sent at the contact at t = {format_number(step.t)}, "
+                f"got {f.lag}"
             )
         outgoing[observation.agent].append(observation)
     return [old + new for old, new in zip(outgoing, observed, strict=True)]
+
+
+def _refuse_waiting_changes(
+    step: Step[Any], observed: list[list[Observation]]
+) -> None:
+    """Refuse observations of changes that would wait for the next contact."""
+    for of_agent in observed:
+        for observation in of_agent:
+            if sensor_of(step.filter, observation).uses_previous:
+                raise ValueError(
+                    "observations of a sensor of changes must be sent at once, got one of "
+                    f"agent {observation.agent} at t = {format_number(step.t)}, where the "
+                    "graph has no links"
+                )
 
 
 def _pack(step: Step[Any], observations: list[Observation]) -> Any:

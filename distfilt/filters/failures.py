@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..linalg import SolverError
-from ..validation import Array
+from ..validation import Array, format_number
 
 __all__ = [
     "RECOVERABLE",
@@ -59,7 +59,7 @@ class FilterError(RuntimeError):
         self.why = str(why)
         run_text = f"run {', '.join(map(str, run))}, " if run else ""
         agent_text = "" if agent is None else f"agent {agent}, "
-        super().__init__(f"{run_text}{agent_text}t = {t:g} s: {why}")
+        super().__init__(f"{run_text}{agent_text}t = {format_number(t)} s: {why}")
 
     def __reduce__(self) -> tuple[Any, ...]:
         return FilterError, (self.run, self.agent, self.t, self.why)

@@ -4,26 +4,46 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, cast
 
 import numpy as np
 
 from ..gaussians.single import condition, unscented_points
-from ..linalg import EPS, cholesky, deviations, solve_upper, symmetrise
+from ..linalg import (
+    EPS,
+    cholesky,
+    deviations,
+    factor,
+    solve_semidefinite,
+    solve_upper,
+    symmetrise,
+)
 from ..models import LinearModel
-from ..validation import Array, Bounds, NonNegativeFloat, PositiveInt
+from ..periods import fold, step_members, warn_of_wrapping, wrap_differences
+from ..validation import (
+    Array,
+    Bounds,
+    NonNegativeFloat,
+    PositiveInt,
+    all_finite,
+    format_number,
+)
 from .base import SensorFilter
+from .bridge import insert_gaussian
 from .options import (
     ExchangesAtIntervals,
     FusesBeliefs,
     IsolatesRuns,
     KeepsPast,
+    ScoresObservations,
     SharesObservations,
 )
-from .priors import Prior, prior_moments
+from .priors import Prior, moments_by_agent
 from .record import Summary
+from .resets import Reset, reset_gaussian
 from .states import SensorState
 from .step import Received, Step
 
@@ -103,6 +123,7 @@ class GaussianFilter(
     ExchangesAtIntervals[GaussianState],
     KeepsPast[GaussianState],
     IsolatesRuns[GaussianState],
+    ScoresObservations[GaussianState],
 ):
     """One Kalman filter per agent; for a linear model and linear sensors it is exact.
 
@@ -110,7 +131,7 @@ class GaussianFilter(
     ----------
     model, sensors, graph, gate_probability, faults, names
         As for :class:`~distfilt.filters.SensorFilter`.
-    fusion, share_observations, lag, on_error, exchange_interval
+    fusion, share_observations, lag, on_error, exchange_interval, record_evidence
         As in :mod:`distfilt.filters.options`. The rule is a function
         ``fusion((means, covs), channel) -> (means, covs)``, such as
         :func:`distfilt.network.covariance_intersection`.
@@ -161,19 +182,25 @@ class GaussianFilter(
     def initial_state(
         self, prior: Prior, runs: tuple[int, ...], rng: Any
     ) -> dict[str, Any]:
-        """Return the prior's mean and covariance, the same for all agents and runs."""
+        """Return the prior's mean and covariance, the same for all runs."""
         d = self.model.dim
-        # Unscented points need a Cholesky factor.
-        is_extended = self.linearization == "extended"
-        definiteness = "semidefinite" if is_extended else "definite"
-        mean, cov = prior_moments(prior, d, definiteness)
+        mean, cov = moments_by_agent(prior, d, self.n_agents)
         lead = (*runs, self.n_agents)
+        mean = wrap_differences(mean, self.periods)
         # Without a past the joint state is the present one.
         return {
             "joint_means": np.broadcast_to(mean, (*lead, d)).copy(),
             "joint_covariances": np.broadcast_to(cov, (*lead, d, d)).copy(),
             "dim": d,
         }
+
+    def reset_belief(self, state: GaussianState, reset: Reset) -> GaussianState:
+        """Return the state with a new belief about some components."""
+        return cast(GaussianState, reset_gaussian(state, reset))
+
+    def insert_time(self, state: GaussianState, t: float) -> GaussianState:
+        """Return the state with a belief about a time between two that it keeps."""
+        return cast(GaussianState, insert_gaussian(self, state, t))
 
     def next_state(self, step: Step[GaussianState]) -> GaussianState:
         """Forecast, condition on the received observations, fuse.
@@ -194,8 +221,10 @@ class GaussianFilter(
         covs = step.keep_failed(covs, unit)
         if step.has_fusion:
             means, covs = self._fuse(means, covs, step)
+        # The mean of each time by itself: a covariance does not depend on the branch.
+        n_times = means.shape[-1] // self.model.dim
         return step.end(
-            joint_means=means,
+            joint_means=wrap_differences(means, self.periods * n_times),
             joint_covariances=symmetrise(covs),
             dim=step.state.dim,
             history=step.times[::-1],
@@ -216,7 +245,7 @@ class GaussianFilter(
             return state.joint_means.copy(), state.joint_covariances.copy()
         d = state.dim
         mean, slope, extra = self._linearize(
-            partial(model.step, t=state.t, dt=dt),
+            partial(self._step_points, step),
             partial(model.jacobian, t=state.t, dt=dt),
             state.means,
             state.covariances,
@@ -239,6 +268,14 @@ class GaussianFilter(
             cov[..., :, :d] *= self.inflation
         return mean, cov
 
+    def _step_points(self, step: Step[GaussianState], points: Array) -> Array:
+        """Move points (..., N, d) without noise, on one branch."""
+        t = step.state.t
+        moved = step_members(self.model, points, t, step.dt)
+        if self.notices_wrapping:
+            warn_of_wrapping(self.model, points, moved, t, step.dt)
+        return moved
+
     def _linearize(
         self,
         function: Callable[[Array], Array],
@@ -254,7 +291,7 @@ class GaussianFilter(
             # Differences are scaled by the state's standard deviations.
             slope = jacobian(mean) if is_linear else jacobian(mean, std=deviations(cov))
             return value, slope, 0.0
-        root = cholesky(cov)
+        root = _factor_covariance(cov)
         d = mean.shape[-1]
         points, weights = unscented_points(mean, root, kappa=self.kappa)
         values = function(points)
@@ -265,10 +302,14 @@ class GaussianFilter(
         ahead = values[..., 1 : d + 1, :]
         behind = values[..., d + 1 :, :]
         scaled_slope = (ahead - behind) / (2 * np.sqrt(d + self.kappa))
-        slope = solve_upper(root, scaled_slope).mT
+        slope = solve_upper(_fill_zero_columns(root), scaled_slope).mT
         # The covariance of the values beyond the linear part H P Hᵀ.
         total = (weights[:, None] * anomalies).mT @ anomalies
-        return value, slope, total - scaled_slope.mT @ scaled_slope
+        extra = total - scaled_slope.mT @ scaled_slope
+        if not all_finite(extra):
+            # Components that some point cannot see are left out, and have none.
+            extra = np.where(np.isnan(extra), 0.0, extra)
+        return value, slope, extra
 
     def _condition(
         self,
@@ -289,19 +330,19 @@ class GaussianFilter(
         mean = joint_mean[..., block]
         cov = joint_cov[..., block, block]
         linear = group.linear
+        predict = partial(group.predict, branch="first")
         predicted, slope, extra = self._linearize(
-            group.predict, group.jacobian, mean, cov, linear
+            predict, group.jacobian, mean, cov, linear
         )
+        if not linear:
+            predicted = self._leave_out_unseen(predicted, slope, group, step)
+        predicted_cov = slope @ cov @ slope.mT + extra
 
-        def moments_on_one_branch(_: Array) -> tuple[Array, Array]:
-            """Return the moments about one branch, whatever the observed angle is."""
-            predict = partial(group.predict, same_branch=True)
-            value, h, remainder = self._linearize(
-                predict, group.jacobian, mean, cov, linear
-            )
-            return value, h @ cov @ h.mT + remainder
+        def moments(_: Array) -> tuple[Array, Array]:
+            """Return the moments of the prediction, which lie on one branch."""
+            return predicted, predicted_cov
 
-        group = step.gate(group, moments_on_one_branch, predicted[..., None, :])
+        group = step.gate(group, moments, predicted[..., None, :])
         # S = H P Hᵀ + R, where the extra covariance of the unscented points counts as noise.
         noise = np.full((*slope.shape[:-1], slope.shape[-2]), group.noise) + extra
         if joint_mean.shape[-1] > d:
@@ -317,6 +358,28 @@ class GaussianFilter(
             (joint_mean, joint_cov),
             group.agents,
         )
+
+    def _leave_out_unseen(
+        self,
+        predicted: Array,
+        slope: Array,
+        group: Received,
+        step: Step[GaussianState],
+    ) -> Array:
+        """Return predictions that are NaN where the sensor cannot see, and count these."""
+        is_unseen = np.isnan(predicted)
+        reason = "some point of a belief cannot see"
+        if not all_finite(slope):
+            is_unseen |= np.isnan(slope).any(axis=-1)
+            predicted = np.where(is_unseen, np.nan, predicted)
+        if self.linearization == "extended":
+            reason = "the sensor is at a singular point, where its derivative is zero or NaN"
+            is_unseen |= ~slope.any(axis=-1)
+        if is_unseen.any():
+            for part in group.likelihoods:
+                is_unseen[(..., *part.cells)] = False
+            step.note_unseen(group, is_unseen, reason)
+        return predicted
 
     def _fuse(
         self, means: Array, covs: Array, step: Step[GaussianState]
@@ -339,8 +402,10 @@ class GaussianFilter(
         d = self.model.dim
         mean = means[..., :d]
         cov = symmetrise(covs[..., :d, :d])
-        # Only the present marginal is fused.
-        fused_mean, fused_cov = step.fuse(mean, cov)
+        # Only the present marginal is fused, with all agents' means on one branch.
+        common = fold(mean, self.periods)
+        fused_mean, fused_cov = step.fuse(common, cov)
+        fused_mean = fused_mean + (mean - common) if self.periods else fused_mean
         variance = np.diagonal(fused_cov, axis1=-2, axis2=-1)
         # A variance that is negative by rounding alone is small beside the largest one.
         if (variance < -1e-9 * np.abs(variance).max()).any():
@@ -350,7 +415,8 @@ class GaussianFilter(
         # A variance below (ε m)² cannot come from independent information.
         if ((variance > 0) & (variance < (EPS * fused_mean) ** 2)).any():
             warnings.warn(
-                f"covariance after fusion is below rounding at t = {step.t:g} s: "
+                "covariance after fusion is below rounding at t = "
+                f"{format_number(step.t)} s: "
                 "information is probably counted twice",
                 RuntimeWarning,
                 4,
@@ -358,9 +424,39 @@ class GaussianFilter(
         if means.shape[-1] == d:
             return fused_mean, fused_cov
         # With the gain G = P_joint,now P_now⁻¹: m + G Δm and P + G ΔP Gᵀ.
-        gain = np.linalg.solve(cov, covs[..., :d, :]).mT
+        gain = solve_semidefinite(cov, covs[..., :d, :]).mT
         shift = (gain @ (fused_mean - mean)[..., None])[..., 0]
         return means + shift, covs + gain @ (fused_cov - cov) @ gain.mT
+
+
+def _factor_covariance(cov: Array) -> Array:
+    """Return the lower factor of covariances, with zero columns where they are singular.
+
+    >>> _factor_covariance(np.diag([4.0, 0.0]))
+    array([[2., 0.],
+           [0., 0.]])
+    """
+    with suppress(np.linalg.LinAlgError):
+        return cholesky(cov)
+    root = factor(cov)
+    std = np.sqrt(np.abs(np.diagonal(cov, axis1=-2, axis2=-1)))
+    scale = std[..., :, None] * std[..., None, :]
+    # A negative eigenvalue has no root, so that the product misses the covariance.
+    if not (np.abs(root @ root.mT - cov) <= 1e-9 * scale).all():
+        raise np.linalg.LinAlgError("covariance must be positive semidefinite")
+    return root
+
+
+def _fill_zero_columns(root: Array) -> Array:
+    """Return a triangular factor with ones on its diagonal in the columns of zeros.
+
+    Such a column is that of a known constant, or of a component that others determine: its points
+    lie at the mean, and its derivative counts as zero.
+    """
+    is_zero = np.diagonal(root, axis1=-2, axis2=-1) == 0
+    if not np.count_nonzero(is_zero):
+        return root
+    return np.asarray(root + np.where(is_zero[..., None], np.eye(root.shape[-1]), 0.0))
 
 
 def _condition_rows(

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
+from itertools import product
 
 import numpy as np
 
+from ..linalg import cholesky, quadratic_form
 from ..mixtures import GaussianMixture
 from ..mixtures.conditioning import update_mixture
+from ..mixtures.fusion import align_mixture
+from ..periods import Periods
 from ..validation import Array, Bounds, NonNegativeInt, PositiveInt, validated
 from .mixture import MixtureState, TargetMixtureFilter
 from .observations import Observation, sensor_of
@@ -214,9 +218,10 @@ class InformationIncrementFilter(TargetMixtureFilter):
             if before is None or not listeners[agent]:
                 continue
             with step.failing_as(agent):
-                increment = information_increment(
-                    before.marginal(target), after[agent].marginal(target)
-                )
+                periods = self.periods[: self.target_dim]
+                new = after[agent].marginal(target)
+                old = align_mixture(before.marginal(target), new.mean, periods)
+                increment = information_increment(old, new)
             # An increment below the threshold is sent with the next one.
             if increment.size:
                 # Without the zeros below the diagonal: 13 numbers for two rows of six.
@@ -238,11 +243,12 @@ class InformationIncrementFilter(TargetMixtureFilter):
                 # z = H t + unit noise, as the sender's observations.
                 increment = _unpack(payload, self.target_dim)
                 before = unsent[agent]
+                periods = self.periods[: self.target_dim]
                 with step.failing_as(agent):
-                    after[agent] = _add_increment(after[agent], increment)
+                    after[agent] = _add_increment(after[agent], increment, periods)
                     # A received increment counts for both, so that it is not sent on.
                     if before is not None:
-                        unsent[agent] = _add_increment(before, increment)
+                        unsent[agent] = _add_increment(before, increment, periods)
 
     def _split_shared(
         self, observations: Sequence[Observation]
@@ -268,6 +274,28 @@ class InformationIncrementFilter(TargetMixtureFilter):
         return private, shared
 
 
+def _choose_branch(
+    belief: GaussianMixture, rows: Array, values: Array, periods: Periods
+) -> Array:
+    """Return an increment's values z = H t for the receiver's branch of circular components.
+
+    The sender's may be a period away: the most probable is taken.
+
+    >>> receiver = GaussianMixture.gaussian([-3.1], [[0.1]])
+    >>> _choose_branch(receiver, np.eye(1), np.array([3.1]), (2 * np.pi,)).round(4)
+    array([-3.1832])
+    """
+    n = len(periods)
+    mean, cov = belief.marginal(range(n)).moments()
+    turns = [(-1, 0, 1) if period else (0,) for period in periods]
+    shifts = np.array(list(product(*turns))) * [period or 0.0 for period in periods]
+    # All candidates z + H s, compared by the length of S^(-1/2) (z + H s - H m).
+    candidates = values + shifts @ rows.T
+    root = cholesky(rows @ cov @ rows.T + np.eye(len(values)))
+    distances = quadratic_form(root, candidates - rows @ mean)
+    return np.asarray(candidates[distances.argmin()])
+
+
 def _unpack(numbers: Array, n: int) -> Array:
     """Return the increment of n components, whose number of rows follows from its length."""
     # r rows of an upper trapezoid with n + 1 columns.
@@ -278,10 +306,14 @@ def _unpack(numbers: Array, n: int) -> Array:
     return increment
 
 
-def _add_increment(belief: GaussianMixture, increment: Array) -> GaussianMixture:
+def _add_increment(
+    belief: GaussianMixture, increment: Array, periods: Periods
+) -> GaussianMixture:
     """Condition a belief on an increment's observations of its first components."""
     rows = increment[:, :-1]
     values = increment[:, -1]
+    if any(period is not None for period in periods):
+        values = _choose_branch(belief, rows, values, periods)
 
     def predict(x: Array) -> Array:
         return x[..., : rows.shape[1]] @ rows.T

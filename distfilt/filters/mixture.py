@@ -12,7 +12,16 @@ import numpy as np
 from ..linalg import deviations
 from ..mixtures import GaussianMixture, runnalls
 from ..mixtures.conditioning import propagate_mixture, update_mixture, within_gate
+from ..mixtures.fusion import align_mixture
 from ..mixtures.splitting import split_nonlinear
+from ..periods import (
+    Periods,
+    check_sensor,
+    fold,
+    settle,
+    step_members,
+    warn_of_wrapping,
+)
 from ..validation import Array, Bounds, InvalidArgumentError, PositiveInt, call_user
 from .base import SensorFilter
 from .observations import Observation, sensor_of
@@ -20,7 +29,7 @@ from .options import ExchangesAtIntervals, FusesBeliefs
 from .priors import Prior, prior_mixtures
 from .record import Summary
 from .states import State
-from .step import Step
+from .step import Step, predict_points
 
 __all__ = ["MixtureFilter", "MixtureState", "TargetMixtureFilter"]
 
@@ -84,7 +93,9 @@ class TargetMixtureFilter(
         self, prior: Prior, runs: tuple[int, ...], rng: Any
     ) -> dict[str, Any]:
         """Return a mixture for each agent."""
-        return {"mixtures": prior_mixtures(prior, self.model.dim, self.n_agents)}
+        mixtures = prior_mixtures(prior, self.model.dim, self.n_agents)
+        settled = [settle_mixture(mixture, self.periods) for mixture in mixtures]
+        return {"mixtures": tuple(settled)}
 
     def next_state(self, step: Step[MixtureState]) -> MixtureState:
         """Split and forecast, condition on the agent's observations, exchange, reduce."""
@@ -103,9 +114,12 @@ class TargetMixtureFilter(
 
     def _reduce(self, belief: GaussianMixture) -> GaussianMixture:
         """Merge components until `n_components` are left."""
+        belief = settle_mixture(belief, self.periods)
         # Of many components only pairs with the heaviest are candidates.
         n_pairs = max(_MAX_ALL_PAIRS, self.n_components)
         reduced = runnalls(belief, self.n_components, heaviest=n_pairs)
+        # A merger may lie beyond half a period.
+        reduced = settle_mixture(reduced, self.periods)
         # A copy without the Cholesky factors that it came with: a loaded state has none.
         return reduced.replace()
 
@@ -155,8 +169,16 @@ class TargetMixtureFilter(
                 )
             noise_sqrt = model.noise_sqrt(t, dt)
             return propagate_mixture(
-                belief, partial(model.step, t=t, dt=dt), noise_sqrt
+                belief, partial(self._step_points, step), noise_sqrt
             )
+
+    def _step_points(self, step: Step[MixtureState], points: Array) -> Array:
+        """Move the components' points (L, N, d) without noise, each component's on one branch."""
+        t = step.state.t
+        moved = step_members(self.model, points, t, step.dt)
+        if self.notices_wrapping:
+            warn_of_wrapping(self.model, points, moved, t, step.dt)
+        return moved
 
     def _condition(
         self,
@@ -185,27 +207,59 @@ class TargetMixtureFilter(
         for observation in observations:
             sensor = sensor_of(self, observation)
             value = observation.value
+            predict = sensor.predict
+            if self.periods:
+                check_sensor(sensor, self.model, belief.means)
+            if sensor.wraps:
+                predict = partial(predict_points, sensor)
             with step.failing_as(agent):
                 if self.gate_probability is not None:
                     value = within_gate(
                         belief,
                         value,
-                        sensor.predict,
+                        predict,
                         sensor.noise_cov,
                         gate=_gate_width(value, self.gate_probability),
                         residual=sensor.residual,
+                        on_branch=True,
                     )
                 # p(y | x) = N(y; h(x), R)
-                likelihood = (value, sensor.predict, sensor.noise_cov)
+                likelihood = (value, predict, sensor.noise_cov)
                 residual = sensor.residual
-                belief = update_mixture(belief, *likelihood, residual=residual)
+                belief = update_mixture(
+                    belief, *likelihood, residual=residual, on_branch=True
+                )
                 # The same observations count for both, or their difference would hold one.
                 if second is not None:
-                    second = update_mixture(second, *likelihood, residual=residual)
+                    second = update_mixture(
+                        second, *likelihood, residual=residual, on_branch=True
+                    )
             # The gate puts NaN in place of a rejected observation.
             if step.rejected is not None:
                 step.rejected[agent] += np.isnan(value).all()
         return belief, second
+
+
+def settle_mixture(mixture: GaussianMixture, periods: Periods) -> GaussianMixture:
+    """Bring a mixture's components onto one branch, with its mean in [-period/2, period/2).
+
+    >>> two = GaussianMixture([0.5, 0.5], [[3.1], [-3.1]], [[[0.1]]] * 2)
+    >>> settle_mixture(two, (2 * np.pi,)).means.ravel().round(4)
+    array([-3.1832, -3.1   ])
+    """
+    if not periods:
+        return mixture
+    weights = mixture.weights
+    means = settle(fold(mixture.means, periods, weights), periods, weights)
+    # The roots of the covariances, which a mixture may hold in its cache, stay.
+    return mixture if means is mixture.means else _move_means(mixture, means)
+
+
+def _move_means(mixture: GaussianMixture, means: Array) -> GaussianMixture:
+    cached = {}
+    if "factors" in vars(mixture):
+        cached["factors"] = mixture.factors
+    return GaussianMixture.construct(mixture.weights, means, mixture.covs, **cached)
 
 
 def _gate_width(value: Array, probability: float) -> float:
@@ -313,6 +367,12 @@ class MixtureFilter(TargetMixtureFilter, FusesBeliefs[MixtureState]):
     ) -> list[GaussianMixture]:
         """Apply the fusion rule and check its results."""
         rule = cast(Any, self.fusion)
+        if self.periods:
+            # All agents' means on one branch.
+            settled = [settle_mixture(belief, self.periods) for belief in beliefs]
+            common = fold(np.array([belief.mean for belief in settled]), self.periods)
+            pairs = zip(settled, common, strict=True)
+            beliefs = [align_mixture(b, mean, self.periods) for b, mean in pairs]
         fused = list(call_user(rule, beliefs, step.channel))
         for agent, (new, old) in enumerate(zip(fused, beliefs, strict=True)):
             if not isinstance(new, GaussianMixture):

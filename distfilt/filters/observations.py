@@ -17,6 +17,7 @@ from ..validation import (
     InvalidArgumentError,
     NonNegativeInt,
     check_array,
+    format_number,
 )
 
 if TYPE_CHECKING:
@@ -71,6 +72,13 @@ class Observation(FrozenModel):
 def sensor_of(f: SensorFilter[Any], observation: Observation) -> Sensor:
     """Return the sensor of an observation: its own, or one of the agent's."""
     if isinstance(observation.sensor, Sensor):
+        f.check_likelihood(observation.sensor)
+        if observation.sensor.uses_previous:
+            raise ValueError(
+                "observations must name one of the agent's sensors to measure a change, got "
+                f"a {observation.sensor.kind} sensor of their own, whose last observation is "
+                "not known"
+            )
         return observation.sensor
     sensors = f.agent_sensors[observation.agent]
     if observation.sensor >= len(sensors):
@@ -156,13 +164,13 @@ def _check_entry(
         return Observation.construct(t, agent, value)
     if (entry.agent, entry.t) != (agent, t):
         raise ValueError(
-            f"{name} must be an Observation of agent {agent} at t = {t:g}, got one of "
-            f"agent {entry.agent} at t = {entry.t:g}"
+            f"{name} must be an Observation of agent {agent} at t = {format_number(t)}, got "
+            f"one of agent {entry.agent} at t = {format_number(entry.t)}"
         )
     if entry.arrival_time is not None and entry.arrival_time > t:
         raise ValueError(
-            f"{name} must have arrived by t = {t:g}, got an Observation that arrives at "
-            f"{entry.arrival_time:g}: pass it as delayed"
+            f"{name} must have arrived by t = {format_number(t)}, got an Observation that "
+            f"arrives at {format_number(entry.arrival_time)}: pass it as delayed"
         )
     return entry
 
@@ -201,9 +209,10 @@ def match_delayed(
         nearest = min(times, key=lambda time: abs(time - t_obs), default=np.inf)
         tolerance = min(1e-9 * max(1.0, abs(t_obs)), 1e-3 * shortest)
         if abs(nearest - t_obs) > tolerance:
-            stored = ", ".join(f"{time:g}" for time in times) or "none with lag = 0"
+            stored = ", ".join(map(format_number, times)) or "none with lag = 0"
             raise ValueError(
-                f"delayed must be of an earlier time that is kept ({stored}), got {t_obs:g}"
+                f"delayed must be of an earlier time that is kept ({stored}), got "
+                f"{format_number(t_obs)}"
             )
         if observation.agent >= f.n_agents:
             raise ValueError(

@@ -29,6 +29,7 @@ __all__ = [
     "FusesBeliefs",
     "IsolatesRuns",
     "KeepsPast",
+    "ScoresObservations",
     "SharesObservations",
 ]
 
@@ -93,6 +94,44 @@ class IsolatesRuns(Filter[S]):
 
     _: KW_ONLY
     on_error: Literal["raise", "keep"] = "raise"
+
+
+@dataclass(frozen=True, eq=False)
+class ScoresObservations(Filter[S]):
+    """A filter that can score the observations by its predictions of them.
+
+    Parameters
+    ----------
+    record_evidence : bool
+        Whether the states and the record have of each step and agent, over the observations that
+        it assimilates (its own, received and delayed ones, not those that the gate rejects):
+        ``log_likelihood``, the logarithm of their density given all earlier observations; ``nis``,
+        their normalised innovation squared, added up; and ``n_observed``, how many numbers they
+        are. The sum of ``log_likelihood`` over a run is the evidence of the model, and for a
+        consistent filter ``nis`` is ``n_observed`` on average.
+
+    Examples
+    --------
+    Two values of the process noise, of which the record prefers the second:
+
+    >>> import numpy as np
+    >>> from distfilt.filters import GaussianFilter
+    >>> from distfilt.models import Model
+    >>> from distfilt.sensors import component
+    >>> for q in (0.01, 1.0):
+    ...     walk = Model(1, lambda x, t, dt: x, lambda t, dt: q * dt * np.eye(1))
+    ...     f = GaussianFilter(walk, [component([0], std=0.1)], record_evidence=True)
+    ...     y = [[0.2], [1.1], [0.4], [-0.9]]
+    ...     run = f.run(f.start(([0.0], [[1.0]])), [1.0, 2.0, 3.0, 4.0], [y])
+    ...     evidence = float(run["log_likelihood"].sum())
+    ...     ratio = float(run["nis"].sum() / run["n_observed"].sum())
+    ...     print(round(evidence, 2), round(ratio, 2))
+    -54.92 28.31
+    -5.53 0.74
+    """
+
+    _: KW_ONLY
+    record_evidence: bool = False
 
 
 @dataclass(frozen=True, eq=False)

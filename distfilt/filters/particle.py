@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 
+from ..linalg import log_sum_exp
+from ..periods import check_transition, fold, settle, warn_of_wrapping
 from ..updates import particles
-from ..validation import Array, Mask, UnitInterval
-from .ensemble import AtLeastTwo, MembersFilter, regress_past
+from ..validation import Array, Indices, Mask, UnitInterval, all_finite, format_number
+from .ensemble import AtLeastTwo, MembersFilter, fuse_members, regress_past
 from .options import ExchangesAtIntervals, SharesObservations
 from .priors import Prior
 from .record import Summary
 from .states import SensorState
-from .step import Received, Step
+from .step import Received, Step, copy_rng
 
 __all__ = ["ParticleFilter", "ParticleState"]
 
@@ -34,6 +36,9 @@ class ParticleState(SensorState):
         Normalised. They are those after the last observation: a step resamples first.
     history : tuple of (float, ndarray)
         Earlier times and where each particle was then.
+    ancestors : ndarray of int, (*runs, A, N), optional
+        From which particle each descends, since the process noise last separated the families of
+        one ancestor; every particle is its own ancestor by default.
 
     Examples
     --------
@@ -51,6 +56,7 @@ class ParticleState(SensorState):
 
     particles: Array
     log_weights: Array
+    ancestors: Any = field(default=None, kw_only=True)
 
     belief_field = "particles", (..., "A", "N", "d")
 
@@ -77,7 +83,7 @@ class ParticleFilter(
     ----------
     model, sensors, graph, gate_probability, faults, names
         As for :class:`~distfilt.filters.SensorFilter`.
-    fusion, share_observations, lag, on_error, exchange_interval
+    fusion, share_observations, lag, on_error, exchange_interval, record_evidence
         As in :mod:`distfilt.filters.options`. The rule is one of ensembles; agents resample
         before it.
     members : int
@@ -88,7 +94,8 @@ class ParticleFilter(
     jitter : float, optional
         Bandwidth of the kernel that separates copies, in [0, 1], in units of the particles'
         weighted spread; 0 for none. Particles that were not copied stay. By default Silverman's
-        for a model without noise, whose copies never part by themselves, and none for others.
+        for a model without noise, whose copies never part by themselves. For others it is used
+        only where few ancestors are left, whose descendants the noise has not separated.
 
     Notes
     -----
@@ -112,12 +119,14 @@ class ParticleFilter(
 
     state_class: ClassVar[type[Any]] = ParticleState
     batched_summary: ClassVar[bool] = True
+    supports_likelihoods: ClassVar[bool] = True
 
     def initial_state(
         self, prior: Prior, runs: tuple[int, ...], rng: Any
     ) -> dict[str, Any]:
         """Draw particles for each agent, with equal weights."""
         drawn = self.draw_prior(prior, (*runs, self.n_agents), rng)
+        drawn = settle(drawn, self.periods)
         # log(1/N)
         log_weights = np.full(drawn.shape[:-1], -np.log(self.members))
         return {"particles": drawn, "log_weights": log_weights}
@@ -128,31 +137,45 @@ class ParticleFilter(
         Warns
         -----
         ParticleCollapse
-            If less than a hundredth of an agent's particles, or only one, are distinct, or if the
-            effective size of its weights is below two.
+            If less than a hundredth of an agent's particles, or only one, are distinct, if the
+            effective size of its weights is below two, or if its particles descend from few, whom
+            the process noise has not separated, so that they are worth fewer than five.
         """
         state = step.state
         # Whole paths are resampled: the stack holds each particle's earlier states too.
         stack = step.stack(state.particles)
-        log_weights = self._resample(stack, state, step)
+        log_weights, ancestors = self._resample(stack, state, step)
         # Where each particle comes from: resampling has moved it from its place in the state.
         origin = stack[-1]
         if step.dt:
+            if self.periods:
+                check_transition(self.model, origin.mean(axis=-2), state.t, step.dt)
             moved = self.model.sample_step(origin, state.t, step.dt, rng=step.rng)
             stack[-1] = step.check_forecast(moved, origin)
+            if self.notices_wrapping:
+                warn_of_wrapping(self.model, origin, moved, state.t, step.dt)
         for place, group in step.received():
-            past = [origin] if step.dt else stack[:-1]
-            self._weight(log_weights, stack[place], place, group, past, step)
+            self._weight(log_weights, stack, place, group, origin, step)
+        if self.periods:
+            # Moments and fusion need one branch: that about the weighted particles' direction.
+            weights = np.exp(log_weights)
+            stack = [fold(paths, self.periods, weights) for paths in stack]
         if step.has_fusion:
             # A fusion rule moves an ensemble, so the particles need equal weights.
             offset = step.rng.random((*log_weights.shape[:-1], 1))
             everybody = np.ones(log_weights.shape[:-1], bool)
             weights = np.exp(log_weights)
-            self._select(stack, log_weights, weights, everybody, offset)
-        (fused,) = step.fuse(stack[-1])
+            self._select(stack, log_weights, weights, everybody, offset, ancestors)
+        fused = fuse_members(step, stack[-1])
         # The fusion moves the present particles; the earlier ones follow by regression.
         past = regress_past(stack, fused)
-        after = step.end(particles=fused, log_weights=log_weights, past=past)
+        if self.periods:
+            weights = np.exp(log_weights)
+            fused = settle(fused, self.periods, weights)
+            past = [settle(paths, self.periods, weights) for paths in past]
+        after = step.end(
+            particles=fused, log_weights=log_weights, past=past, ancestors=ancestors
+        )
         self._warn(after)
         return after
 
@@ -174,26 +197,50 @@ class ParticleFilter(
     def _weight(
         self,
         log_weights: Array,
-        members: Array,
+        stack: list[Array],
         place: int,
         group: Received,
-        past: list[Array],
+        origin: Array,
         step: Step[ParticleState],
     ) -> None:
         """Multiply a group's weights by the likelihood of its observations, in place."""
         rows = group.rows
-        previous = step.before(place, group, past)
-        predicted = group.predict(members[..., rows, :, :], previous)
+        previous = step.before(place, group, stack[:-1], origin)
+        members = stack[place][..., rows, :, :]
+        predicted = group.predict(members, previous, branch="each")
+        if not all_finite(predicted):
+            # A particle that cannot see contradicts what was seen, unless none can.
+            is_unseen = np.isnan(predicted).all(axis=-2)
+            step.note_unseen(group, is_unseen, "no particle can see")
         # log w' = log w + log p(y | x), normalised; the gate weighs by the old weights.
         old = log_weights[..., rows, :]
-        group = step.gate(group, _moments_by_logs, predicted, old)
+        group = step.gate(
+            group,
+            _moments_by_logs,
+            predicted,
+            old,
+            is_torn=True,
+            is_gaussian=False,
+            weighted=(members, np.exp(old)) if group.likelihoods else None,
+        )
+        # Sensors that are likelihoods change the weights before the Gaussian ones.
+        group, likelihoods = group.log_likelihood(members)
+        prior = old + likelihoods
+        if step.scores:
+            # log Σ wᵢ p(y | xᵢ)
+            joint = prior + particles.log_likelihood(
+                predicted, group.target, group.noise, contradict=True
+            )
+            normalizer = particles.log_normalizer(group.target, group.noise)
+            total = log_sum_exp(joint)[..., 0] + normalizer
+            step.add_log_likelihood(total, group.agents)
 
         def compute(h: Array, y: Array, logs: Array, noise: Array, _: Any) -> Any:
             return (particles.reweight(logs, h, y, noise),)
 
         (new,) = step.apply(
             compute,
-            (predicted, group.target, old),
+            (predicted, group.target, prior),
             (old,),
             group.agents,
             shared=group.noise,
@@ -202,8 +249,10 @@ class ParticleFilter(
 
     def _resample(
         self, stack: list[Array], state: ParticleState, step: Step[ParticleState]
-    ) -> Array:
-        """Resample agents with a small effective size, in place; return the log-weights.
+    ) -> tuple[Array, Indices]:
+        """Resample agents with a small effective size, in place.
+
+        Returns the log-weights, and each particle's ancestor.
 
         >>> from distfilt.models import constant_velocity
         >>> f = ParticleFilter(
@@ -226,6 +275,7 @@ class ParticleFilter(
         array([False,  True])
         """
         log_weights = state.log_weights.copy()
+        ancestors = find_ancestors(state)
         before = stack[-1]
         # Every agent draws, also if it does not resample: its numbers must not depend on
         # another's weights.
@@ -235,24 +285,59 @@ class ParticleFilter(
         # N_eff = 1 / Σ w²
         is_due = state.effective_size < self.ess_threshold * self.members
         if not is_due.any():
-            return log_weights
-        counts = self._select(stack, log_weights, state.weights, is_due, offset)
+            return log_weights, ancestors
+        is_few = is_due & self._has_few_ancestors(ancestors)
+        sizes, shares = measure_families(before, state.weights, ancestors, is_few)
+        is_renewed = is_few & (shares > 0.5)
+        is_collapsed = sizes < max(_FEWEST, 0.02 * self.members)
+        counts = self._select(
+            stack, log_weights, state.weights, is_due, offset, ancestors
+        )
+        if noise is None and self.jitter is None and is_collapsed.any():
+            # The noise is too small to separate copies. A generator of its own, so that the
+            # draws of the others do not change.
+            words = copy_rng(step.rng).bit_generator.random_raw(4).tolist()
+            noise = np.random.default_rng(words).standard_normal(before.shape)
+            noise[~is_collapsed] = 0.0
+            bandwidth = particles.silverman(self.members, self.model.dim)
         if noise is not None:
-            # Where one weight dominates, the weighted spread is gone; all particles' is used.
-            is_degenerate = state.effective_size[is_due][:, None] < 2
-            equal = 1 / self.members
-            weights = np.where(is_degenerate, equal, state.weights[is_due])
-            _, cov = compute_moments(before[is_due], weights)
-            is_copied = (counts > 1)[..., None]
-            copied = particles.repeat_by_count(is_copied, counts)
-            stack[-1][is_due] = particles.add_jitter(
+            stack[-1][is_due] = self._separate_copies(
                 stack[-1][is_due],
-                cov,
-                bandwidth,
+                before[is_due],
+                state.weights[is_due],
+                counts,
                 noise[is_due],
-                copied.reshape(-1, self.members),
+                bandwidth,
             )
-        return log_weights
+        # Families begin anew once the noise has separated their members.
+        ancestors[is_renewed] = np.arange(self.members)
+        return log_weights, ancestors
+
+    def _separate_copies(
+        self,
+        resampled: Array,
+        before: Array,
+        weights: Array,
+        counts: Indices,
+        noise: Array,
+        bandwidth: float,
+    ) -> Array:
+        """Add noise to copies in units of the weighted spread before the resampling."""
+        # Where one weight dominates, the weighted spread is gone; all particles' is used.
+        is_degenerate = particles.size_of(weights)[:, None] < 2
+        weights = np.where(is_degenerate, 1 / self.members, weights)
+        _, cov = compute_moments(before, weights)
+        is_copied = (counts > 1)[..., None]
+        copied = particles.repeat_by_count(is_copied, counts)
+        return particles.add_jitter(
+            resampled, cov, bandwidth, noise, copied.reshape(-1, self.members)
+        )
+
+    def _has_few_ancestors(self, ancestors: Indices) -> Mask:
+        """Whether less than a tenth of an agent's particles are ancestors of all."""
+        # Resampling keeps the order, so descendants of one ancestor stand together.
+        n_families = 1 + (ancestors[..., 1:] != ancestors[..., :-1]).sum(axis=-1)
+        return np.asarray(n_families < 0.1 * self.members)
 
     def _bandwidth(self, t: float, dt: float) -> float:
         """Return the bandwidth of the jitter; by default none if the model has noise."""
@@ -270,8 +355,9 @@ class ParticleFilter(
         weights: Array,
         agents: Mask,
         offset: Array,
+        ancestors: Indices,
     ) -> Any:
-        """Resample some agents' paths in the stack; their weights are equal then.
+        """Resample some agents' paths in the stack and their ancestors; weights are equal then.
 
         Returns how often each particle was taken.
         """
@@ -284,6 +370,8 @@ class ParticleFilter(
                 stack[k][rows] = taken
             else:
                 stack[k] = taken
+        labels = particles.repeat_by_count(ancestors[rows][..., None], counts)
+        ancestors[rows] = labels[..., 0]
         # After resampling every particle has the weight 1/N.
         log_weights[rows] = -np.log(self.members)
         return counts
@@ -320,6 +408,7 @@ class ParticleFilter(
         """
         points = state.particles
         size = state.effective_size
+        worth = self._measure_related(state)
         if np.count_nonzero(state.failed):
             points = points[~state.failed]
             size = size[~state.failed]
@@ -329,9 +418,22 @@ class ParticleFilter(
             problem = f"{distinct:.2%} of an agent's particles are distinct"
         elif size.min(initial=np.inf) < 2:
             problem = f"an agent's weights have an effective size of {size.min():.1f}"
+        elif worth < 0.5 * _FEWEST:
+            problem = (
+                f"an agent's particles are worth {worth:.1f}: they descend from few, and "
+                "the process noise has not separated them"
+            )
         else:
             return
-        particles.warn_of_collapse(f"t = {state.t:g} s: {problem}", "jitter=")
+        time = format_number(state.t)
+        particles.warn_of_collapse(f"t = {time} s: {problem}", "jitter=")
+
+    def _measure_related(self, state: ParticleState) -> float:
+        """Return the least effective number of an agent's families; infinity if there are many."""
+        ancestors = find_ancestors(state)
+        is_few = self._has_few_ancestors(ancestors) & ~state.failed[..., None]
+        sizes, _ = measure_families(state.particles, state.weights, ancestors, is_few)
+        return float(sizes.min(initial=np.inf))
 
     def _count_distinct(self, points: Array, fewest: float) -> float:
         """Return a lower bound of each agent's number of distinct particles, above `fewest`."""
@@ -346,8 +448,70 @@ class ParticleFilter(
         return bound
 
 
+_FEWEST = 10.0
+"""Copies are jittered if the particles are worth fewer independent ones, or a fiftieth of them;
+below half of this number, a warning is given."""
+
+
+def find_ancestors(state: ParticleState) -> Indices:
+    """Return the ancestors of a state's particles, a copy; by default each is its own."""
+    shape = state.log_weights.shape
+    if np.shape(state.ancestors) == shape:
+        return np.array(state.ancestors, dtype=np.intp)
+    return np.broadcast_to(np.arange(shape[-1]), shape).copy()
+
+
+def measure_families(
+    points: Array, weights: Array, ancestors: Indices, agents: Mask
+) -> tuple[Array, Array]:
+    """Return what the particles of some agents are worth, and how far families are separated.
+
+    Families of weights W_a and of the share s of the variance within them have a weighted mean
+    with the error of 1 / (Σ W_a² (1 - s)) independent particles. The first result is this number
+    and the second s, each the least over the components; infinity and one for other agents.
+
+    >>> x = np.array([[[0.0], [0.1], [1.0], [1.1]], [[0.0], [1.0], [0.0], [1.0]]])
+    >>> families = np.array([[0, 0, 3, 3]] * 2)
+    >>> agents = np.array([True, True])
+    >>> sizes, shares = measure_families(x, np.full((2, 4), 0.25), families, agents)
+    >>> sizes.round(2), shares.round(2)
+    (array([2.02, inf]), array([0.01, 1.  ]))
+    """
+    sizes = np.full(agents.shape, np.inf)
+    shares = np.ones(agents.shape)
+    for index in map(tuple, np.argwhere(agents)):
+        x = points[index]
+        w = weights[index][:, None]
+        labels = ancestors[index]
+        starts = np.flatnonzero(np.diff(labels, prepend=labels[0] - 1))
+        counts = np.diff(starts, append=labels.size)
+        mass = np.add.reduceat(w, starts)
+        # Means of the families, at each of their members.
+        positive = np.maximum(mass, np.finfo(float).tiny)
+        means = np.repeat(np.add.reduceat(w * x, starts) / positive, counts, axis=0)
+        mean = (w * x).sum(axis=0)
+        within = (w * (x - means) ** 2).sum(axis=0)
+        total = (w * (x - mean) ** 2).sum(axis=0)
+        # A component that is known has no variance but rounding.
+        is_spread = np.asarray(total > (1e-12 * np.abs(mean)) ** 2)
+        if not is_spread.any():
+            continue
+        shares[index] = min((within[is_spread] / total[is_spread]).min(), 1.0)
+        between = (mass**2).sum() * (1 - shares[index])
+        sizes[index] = 1 / between if between > 0 else np.inf
+    return sizes, shares
+
+
 def _moments_by_logs(predicted: Array, log_weights: Array) -> tuple[Array, Array]:
-    return compute_moments(predicted, np.exp(log_weights))
+    weights = np.exp(log_weights)
+    if not all_finite(predicted):
+        # Of the particles that can see; NaN if there are none.
+        sees = ~np.isnan(predicted).any(axis=-1)
+        weights = np.where(sees, weights, 0.0)
+        total = weights.sum(axis=-1, keepdims=True)
+        weights = weights / np.where(total > 0, total, np.nan)
+        predicted = np.where(sees[..., None], predicted, 0.0)
+    return compute_moments(predicted, weights)
 
 
 def compute_moments(points: Array, weights: Array) -> tuple[Array, Array]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..periods import Periods
 from ..sensors import Sensor
-from ..validation import Array, check_array, check_increasing
+from ..validation import Array, check_array, check_increasing, format_number
+from ..validation.clocks import warn_of_clock
 from .observations import Observation, are_observations, list_by_agent
 
 if TYPE_CHECKING:
@@ -22,7 +24,7 @@ else:
     # Checked by `plan_steps`, which converts it.
     TimesArgument = Any
 
-__all__ = ["TimesArgument", "plan_steps"]
+__all__ = ["TimesArgument", "find_degrees", "plan_steps"]
 
 
 def plan_steps(
@@ -58,8 +60,10 @@ def plan_steps(
         entries = _plan_series(f, grid, observations)
     if grid.size and grid[0] < state.t:
         raise ValueError(
-            f"times must start at the state's time {state.t:g} or later, got {grid[0]:g}"
+            f"times must start at the state's time {format_number(state.t)} or later, got "
+            f"{format_number(grid[0])}"
         )
+    warn_of_clock(state.t, grid, "times")
     return grid, entries
 
 
@@ -79,6 +83,10 @@ def _plan_events(
         if event.t not in by_time:
             by_time[event.t] = [[] for _ in range(f.n_agents)]
         by_time[event.t][event.agent].append(event)
+    if hasattr(f, "agent_sensors"):
+        wild = find_degrees(f, events)
+        if wild is not None:
+            warnings.warn(wild, RuntimeWarning, stacklevel=5)
     times = np.array(sorted(by_time))
     return times, iter([by_time[t] for t in times])
 
@@ -101,28 +109,108 @@ def _plan_series(f: Filter[Any], grid: Array, observations: Any) -> Iterator[Any
                 f"got length {len(series)}"
             )
         if isinstance(series, np.ndarray) and sensors:
-            _warn_of_degrees(sensors[agent], series, agent)
+            _check_series(sensors[agent], series, agent)
+        if series is not None and sensors:
+            _warn_of_degrees(f, sensors[agent], series, agent)
     return (
         [None if series is None else series[k] for series in series_by_agent]
         for k in range(grid.size)
     )
 
 
-def _warn_of_degrees(sensors: Sequence[Sensor], series: Array, agent: int) -> None:
-    """Warn of angles that are more than four turns away from their wrapped values."""
-    if len(sensors) != 1 or sensors[0].residual_function is None:
-        return
-    sensor = sensors[0]
-    if series.shape[-1:] != (sensor.dim,):
-        return
-    observed = np.nan_to_num(series.astype(np.float64))
-    # y - r(y, 0) is the multiple of the period that wrapping takes off.
-    residual = sensor.residual(observed, 0 * observed)
-    turns = np.abs(observed - residual).max(initial=0.0) / (2 * np.pi)
-    if turns > 4:
-        warnings.warn(
-            f"observations[{agent}] must be angles in rad, got some {turns:.0f} turns off: "
-            "are they in degrees?",
-            RuntimeWarning,
-            stacklevel=4,
+def _check_series(sensors: Sequence[Sensor], series: Array, agent: int) -> None:
+    """Refuse a series of numbers without an axis for the components, (T,) for (T, 1)."""
+    if series.ndim == 1 and series.dtype.kind in "fiu" and len(sensors) == 1:
+        size = series.size
+        raise ValueError(
+            f"observations must have shape ({size}, ..., {sensors[0].dim}) for agent {agent}, "
+            f"got ({size},): a series of single numbers has one component, give y[:, None]"
         )
+
+
+def _warn_of_degrees(
+    f: Filter[Any], sensors: Sequence[Sensor], series: Any, agent: int
+) -> None:
+    """Warn if a series of arrays, or of Observations, has angles in degrees."""
+    entries: list[Observation] = []
+    if isinstance(series, np.ndarray) and series.dtype.kind in "fiu":
+        # All values of the only sensor at once.
+        if len(sensors) == 1 and series.shape[-1:] == (sensors[0].dim,):
+            values = series.reshape(-1, sensors[0].dim)
+            entries = [Observation.construct(0.0, agent, values)]
+    elif any(sensor.wraps for sensor in sensors):
+        entries = _list_entries(sensors, series, agent)
+    text = find_degrees(f, entries)
+    if text is not None:
+        warnings.warn(text, RuntimeWarning, stacklevel=5)
+
+
+def _list_entries(
+    sensors: Sequence[Sensor], series: Any, agent: int
+) -> list[Observation]:
+    """Return the entries of a list of times as Observations; what fits no sensor is left out."""
+    result: list[Observation] = []
+    for entry in series:
+        for one in entry if are_observations(entry) else (entry,):
+            if isinstance(one, Observation):
+                result.append(one)
+            elif one is not None and len(sensors) == 1:
+                value = np.asarray(one)
+                if value.dtype.kind in "fiu" and value.shape[-1:] == (sensors[0].dim,):
+                    result.append(Observation.construct(0.0, agent, value))
+    return result
+
+
+def find_degrees(f: Any, observations: Sequence[Observation]) -> str | None:
+    """Return a warning if angles are more than four turns away from their wrapped values.
+
+    Observations are looked at together for each agent and sensor.
+
+    >>> from distfilt.filters import GaussianFilter
+    >>> from distfilt.models import constant_velocity
+    >>> from distfilt.sensors import bearing
+    >>> f = GaussianFilter(constant_velocity(sigma=1.0), [bearing([0, 1], std=0.1)])
+    >>> find_degrees(f, [Observation(0.0, 0, [53.13])])
+    "observations[0] must be angles in rad, got some 8 turns off by a sensor of kind ..."
+    >>> find_degrees(f, [Observation(0.0, 0, [-3.1])])
+    """
+    values: dict[tuple[int, Sensor], list[Array]] = {}
+    for observation in observations:
+        if observation.agent >= f.n_agents:
+            continue  # refused later, by its name
+        sensor = observation.sensor
+        if not isinstance(sensor, Sensor):
+            sensors = f.agent_sensors[observation.agent]
+            if sensor >= len(sensors):
+                continue
+            sensor = sensors[sensor]
+        # Angles below four turns need no closer look.
+        value = np.asarray(observation.value, dtype=np.float64)
+        is_large = sensor.wraps and np.nan_to_num(np.abs(value)).max(initial=0.0) > 25
+        if is_large and value.shape[-1:] == (sensor.dim,):
+            values.setdefault((observation.agent, sensor), []).append(value)
+    for (agent, sensor), parts in values.items():
+        observed = np.concatenate([v.reshape(-1, sensor.dim) for v in parts])
+        observed = np.nan_to_num(observed)
+        turns = _count_turns(sensor, observed)
+        if turns > 4:
+            return (
+                f"observations[{agent}] must be angles in rad, got some {turns:.0f} turns off "
+                f"by a sensor of kind {sensor.kind!r}: are they in degrees?"
+            )
+    return None
+
+
+def _count_turns(sensor: Sensor, observed: Array) -> float:
+    """Return by how many of its turns a sensor's values (N, m) are off, at most."""
+    # y - r(y, 0) is the multiple of the period that wrapping takes off.
+    shift = np.abs(observed - sensor.residual(observed, 0 * observed))
+    if sensor.periods:
+        # A line turns twice while a direction turns once; a period of 360 is in degrees.
+        periods = [p or np.inf for p in cast(Periods, sensor.periods)]
+        turn = np.maximum(periods, 2 * np.pi)
+        return float((shift / turn).max(initial=0.0))
+    full = np.full((1, sensor.dim), 360.0)
+    if np.abs(sensor.residual(full, 0 * full)).min() < 1e-6:
+        return 0.0  # a residual of one's own, in degrees
+    return float(shift.max(initial=0.0) / (2 * np.pi))

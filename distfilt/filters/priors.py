@@ -39,7 +39,14 @@ else:
     # Checked by the functions below, which convert it.
     Prior = Any
 
-__all__ = ["Prior", "draw_members", "prior_mixtures", "prior_moments"]
+__all__ = [
+    "Prior",
+    "draw_members",
+    "moments_by_agent",
+    "prior_mixtures",
+    "prior_moments",
+    "split_by_agent",
+]
 
 
 def _is_mean_and_cov(prior: Any) -> bool:
@@ -149,6 +156,66 @@ def draw_members(
         )
     # One ensemble serves all runs and agents; a copy, since the filter updates in place.
     return np.broadcast_to(ensemble, shape).copy()
+
+
+def split_by_agent(prior: Any, dim: int, n_agents: int) -> list[Any] | None:
+    """Return the priors of a list with one for each agent; None if the prior is one for all.
+
+    A list of priors has ``(mean, cov)`` tuples, distributions, mixtures, functions or arrays of
+    members (N, d).
+
+    >>> normal = ([0.0, 0.0], np.eye(2))
+    >>> split_by_agent(normal, 2, 2) is None, len(split_by_agent([normal, normal], 2, 2))
+    (True, 2)
+    >>> split_by_agent([normal], 2, 2)
+    Traceback (most recent call last):
+    ValueError: prior must be one for all or a list with one for each of 2 agents, got 1
+    """
+    if type(prior) is not list:
+        return None
+    are_priors = [_is_prior(entry, dim) for entry in prior]
+    # Of [mean, cov] the second alone is an array with two axes: that is one prior for all.
+    are_arrays = all(isinstance(e, np.ndarray) for e in prior)
+    if are_arrays and not all(are_priors) or not any(are_priors):
+        return None
+    if len(prior) != n_agents:
+        raise ValueError(
+            f"prior must be one for all or a list with one for each of {n_agents} agents, "
+            f"got {len(prior)}"
+        )
+    for agent, entry in enumerate(prior):
+        if not _is_prior(entry, dim):
+            raise ValueError(
+                f"prior[{agent}] must be a prior as the other agents have one, got "
+                f"{type(entry).__name__}"
+            )
+    return list(prior)
+
+
+def _is_prior(entry: Any, dim: int) -> bool:
+    """Whether an entry of a list is a prior by itself, and not a member of one."""
+    if isinstance(entry, GaussianMixture) or hasattr(entry, "rvs") or callable(entry):
+        return True
+    if type(entry) is tuple:
+        # A member of one component is no pair of numbers, but (mean, variance) may be.
+        return len(entry) == 2 and (dim == 1 or np.ndim(entry[1]) > 1)
+    return isinstance(entry, np.ndarray) and entry.ndim == 2
+
+
+def moments_by_agent(
+    prior: Prior, dim: int, n_agents: int, definiteness: str = "semidefinite"
+) -> tuple[Array, Array]:
+    """Return mean and covariance of a prior, (d,) and (d, d), with an axis of agents for a list.
+
+    >>> means, covs = moments_by_agent([([0.0], [[1.0]]), ([5.0], [[2.0]])], 1, 2)
+    >>> means.shape, covs.shape
+    ((2, 1), (2, 1, 1))
+    """
+    priors = split_by_agent(prior, dim, n_agents)
+    if priors is None:
+        return prior_moments(prior, dim, definiteness)
+    moments = [prior_moments(one, dim, definiteness) for one in priors]
+    return np.array([m for m, _ in moments]), np.array([p for _, p in moments])
 
 
 def prior_mixtures(

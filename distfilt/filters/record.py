@@ -15,8 +15,9 @@ from ..ensembles import sample_covariance
 from ..linalg import cholesky, quadratic_form, to_unit_variances
 from ..metrics import crps, gaussian_crps
 from ..network import Ledger
+from ..periods import align, warn_of_wrapped_truth
 from ..validation import Array, check_array
-from .states import State, stack_states
+from .states import SensorState, State, stack_states
 
 if TYPE_CHECKING:
     import xarray
@@ -37,6 +38,8 @@ SCORES: tuple[Score, ...] = ("squared_error", "nees", "crps")
 _BLOCK_SIZE = 32768
 """Up to how many numbers small states have together whose summaries are made at once."""
 
+_STEP_FIELDS = ("rejected", "log_likelihood", "nis", "n_observed")
+
 _LEDGER_FIELDS = ("messages", "scalars", "bytes", "lost", "rounds")
 
 _MEANING = {
@@ -54,7 +57,20 @@ _MEANING = {
         "normalised estimation error squared; its mean is d for a consistent filter",
         "1",
     ),
+    "unseen": (
+        "observations left out in this step, since a sensor cannot see from the belief",
+        "1",
+    ),
     "rejected": ("observations that the gate rejected in this step", "1"),
+    "log_likelihood": (
+        "logarithm of the density of this step's observations given all earlier ones",
+        "1",
+    ),
+    "nis": (
+        "normalised innovation squared; its mean is n_observed for a consistent filter",
+        "1",
+    ),
+    "n_observed": ("numbers that were observed and assimilated in this step", "1"),
 }
 """Long name and unit of each recorded variable."""
 
@@ -167,7 +183,7 @@ def record_run(
     run = xarray.Dataset(variables, coords=coords)
     # `encoding` is the only place that xarray hands on to copies and selections, and leaves out
     # of tables and files. The agents and the last mean tell a part of the run from all of it.
-    mean = np.array(series["mean"][-1]) if series else None
+    mean = np.array(series["mean"][-1]) if times.size else None
     run.encoding["final_state"] = last, agents, mean
     return run
 
@@ -193,24 +209,66 @@ def _collect_series(
         beliefs = [belief for _, belief in block]
         summary = f.summarize(beliefs[0] if is_single else stack_states(beliefs))
         row = _read_summary(summary)
-        if last.rejected is not None:
-            rejected = [state.rejected for state in states]
-            row["rejected"] = np.array(rejected[0] if is_single else rejected)
+        # Numbers of the steps themselves, where the filter has a gate or scores observations.
+        for name in _STEP_FIELDS:
+            if getattr(last, name) is not None:
+                numbers = [getattr(state, name) for state in states]
+                row[name] = np.array(numbers[0] if is_single else numbers)
+        if isinstance(last, SensorState):
+            unseen = [_read_unseen(state, len(f.agents)) for state in states]
+            row["unseen"] = np.array(unseen[0] if is_single else unseen)
         if known is not None:
             index: Any = first if is_single else slice(first, first + len(block))
-            row |= _score(summary, known.values[index], known.components, scores)
+            values = known.values[index]
+            if f.periods:
+                # A truth that wraps and one that runs on are the same.
+                values = np.broadcast_to(values, summary.mean.shape)
+                values = align(values, summary.mean, f.periods)
+            row |= _score(summary, values, known.components, scores)
         if is_single:
             row = {name: value[None] for name, value in row.items()}
         rows.append(row)
     if not rows:
-        return {}, ledgers, last
+        return _read_nothing(f, start, known, scores), ledgers, last
     series = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+    if known is not None:
+        warn_of_wrapped_truth(f, series["mean"], known.values)
     # sqrt(tr P); NaN fills agents' missing components, and failed runs are NaN altogether.
     variance = series["variance"]
     spread = np.sqrt(np.nansum(variance, axis=-1))
     is_missing = np.isnan(variance).all(axis=-1)
     series["spread"] = np.where(is_missing, np.nan, spread)
     return series, ledgers, last
+
+
+def _read_unseen(state: SensorState, n_agents: int) -> Array:
+    """Return how many observations each agent has left out in a step, (*runs, A)."""
+    if state.unseen is None:
+        return state.mask_failed(np.zeros((*state.runs, n_agents)))
+    return state.mask_failed(state.unseen)
+
+
+def _read_nothing(
+    f: Filter[Any],
+    start: State,
+    known: _KnownTruth | None,
+    scores: Collection[Score],
+) -> dict[str, Array]:
+    """Return the arrays of a record without a single time, (0, ...) each."""
+    summary = f.summarize(start)
+    row = _read_summary(summary)
+    row["spread"] = np.sqrt(np.nansum(summary.variance, axis=-1))
+    lead = row["spread"].shape
+    if isinstance(start, SensorState):
+        row["unseen"] = np.zeros(lead)
+    if f.gate_probability is not None:
+        row["rejected"] = np.zeros(lead)
+    if f.record_evidence:
+        for name in _STEP_FIELDS[1:]:
+            row[name] = np.zeros(lead)
+    if known is not None:
+        row |= _score(summary, 0 * summary.mean, known.components, scores)
+    return {name: np.asarray(value)[None][:0] for name, value in row.items()}
 
 
 def _read_summary(summary: Summary) -> dict[str, Array]:
@@ -362,6 +420,11 @@ def final_state(run: xarray.Dataset) -> State:
     ValueError: run must be the Dataset that a filter's run returned, got one without a state
     """
     encoding = getattr(run, "encoding", {})
+    if "final_state" in encoding and "mean" in run and not run["time"].size:
+        state, _, last_mean = encoding["final_state"]
+        # A run without a time ends where it starts; a selection of none does not.
+        if last_mean is None:
+            return cast(State, state)
     if "final_state" in encoding and "mean" in run and run["time"].size:
         state, agents, last_mean = encoding["final_state"]
         # A selection inherits the entry, but not all agents and times.

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Self, TypeVar, cast
 import numpy as np
 
 from ..network import Ledger
-from ..validation import Array, FrozenModel, Mask, check_array
+from ..validation import (
+    ALLOW_NAN,
+    Array,
+    FrozenModel,
+    Mask,
+    check_array,
+    format_number,
+)
 from .serialization import load_fields, save_state
 
 if TYPE_CHECKING:
@@ -39,6 +46,9 @@ class State(FrozenModel):
         that a state can be stepped twice.
     rejected : ndarray, (*runs, A), optional
         How many observations each agent's gate rejected in the last step; None without a gate.
+    log_likelihood, nis, n_observed : ndarray, (*runs, A), optional
+        Scores of the observations of the last step, see
+        :class:`~distfilt.filters.ScoresObservations`; None if they are not recorded.
 
     Examples
     --------
@@ -50,11 +60,16 @@ class State(FrozenModel):
     ledger: Ledger
     rng: np.random.Generator | None
     rejected: Annotated[Array, "..."] | None = field(default=None, kw_only=True)
+    log_likelihood: Annotated[Array, "...", ALLOW_NAN] | None = field(
+        default=None, kw_only=True
+    )
+    nis: Annotated[Array, "...", ALLOW_NAN] | None = field(default=None, kw_only=True)
+    n_observed: Annotated[Array, "...", ALLOW_NAN] | None = field(default=None, kw_only=True)
 
     def __repr__(self) -> str:
         """Show time and agents; the arrays are long."""
         n_agents = self.ledger.messages.size
-        return f"{type(self).__name__}(t={self.t:g}, {n_agents} agents)"
+        return f"{type(self).__name__}(t={format_number(self.t)}, {n_agents} agents)"
 
     @property
     def runs(self) -> tuple[int, ...]:
@@ -122,6 +137,16 @@ class SensorState(State):
         Runs that failed and are no longer updated.
     pending : tuple of Observation
         Observations that have not been sent yet.
+    last_changes, references : tuple
+        The time of the last observation of each sensor of changes, and the beliefs about those of
+        them that are not in the history.
+    assimilated : tuple
+        The observations of the times that are kept, by which repeated ones are found.
+    unseen : ndarray, (*runs, A), optional
+        How many observations each agent left out in the last step, since the sensor cannot see
+        from its state; None if there were none.
+    warned : tuple of str
+        Warnings that are given once, and have been.
 
     Examples
     --------
@@ -139,6 +164,11 @@ class SensorState(State):
     failed: Mask = field(default_factory=lambda: np.zeros((), dtype=bool), kw_only=True)
     # Observations of the filter, which the generator of a step has checked.
     pending: tuple[Any, ...] = field(default=(), kw_only=True)
+    last_changes: tuple[Any, ...] = field(default=(), kw_only=True)
+    references: tuple[Any, ...] = field(default=(), kw_only=True)
+    assimilated: tuple[Any, ...] = field(default=(), kw_only=True)
+    unseen: Annotated[Array, "..."] | None = field(default=None, kw_only=True)
+    warned: tuple[str, ...] = field(default=(), kw_only=True)
 
     # Without an annotation it is no field of the dataclass.
     belief_field = "belief", tuple[Any, ...]()
@@ -196,8 +226,21 @@ class SensorState(State):
         name, _ = self.belief_field
         states = []
         for t, belief in self.history:
-            states.append(self.replace(t=t, history=(), **{name: belief}))
+            states.append(
+                self.replace(
+                    t=t, history=(), last_changes=(), references=(), **{name: belief}
+                )
+            )
         return tuple(states)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the state to one .npz file; :meth:`load` gives back the same bits.
+
+        Only sensors that came with an observation are not written, so that a repetition of such
+        an observation is not found after loading.
+        """
+        entries = [entry for entry in self.assimilated if isinstance(entry[2], int)]
+        save_state(self.replace(assimilated=tuple(entries)), path)
 
     def mask_failed(self, values: Array) -> Array:
         """Return values (*runs, ...) for the record: NaN in runs that have failed."""
@@ -214,6 +257,6 @@ def stack_states(states: Sequence[AnyState]) -> AnyState:
     # Everything else, such as the time, is taken from the first state.
     arrays = {}
     for name, value in vars(first).items():
-        if type(value) is np.ndarray:
+        if type(value) is np.ndarray and name != "unseen":
             arrays[name] = np.array([getattr(state, name) for state in states])
     return first.replace(**arrays)

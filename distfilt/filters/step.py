@@ -8,20 +8,26 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from ..sensors import Sensor
-from ..validation import Array, Mask, call_user
+from ..models import Model
+from ..periods import check_sensor, gather
+from ..linalg import cholesky, log_det, quadratic_form
+from ..sensors import LikelihoodSensor, Sensor
+from ..validation import Array, Mask, call_user, format_number
 from ..validation.first_use import needs_check
 from . import failures
 from .exchange import Known, collect_observations, fuse_beliefs
 from .failures import RECOVERABLE, FilterError, Row
+from .changes import Previous, References
 from .observations import Observation
+from .repetition import note_assimilated
 from .states import SensorState, State
 
 if TYPE_CHECKING:
@@ -33,6 +39,7 @@ S = TypeVar("S", bound=State)
 
 _NO_RUNS = np.zeros((), dtype=bool)
 _NOTHING = np.zeros((0, 0))
+_LOG_2PI = math.log(2 * math.pi)
 
 
 class Step(Generic[S]):
@@ -60,6 +67,9 @@ class Step(Generic[S]):
         Whether the filter has a fusion rule, and a channel to use it.
     rejected : ndarray, (*runs, A), or None
         How many observations the gate has rejected; None without a gate.
+    scores : dict of str to ndarray, (*runs, A)
+        Scores of the observations, see :class:`~distfilt.filters.ScoresObservations`; empty if
+        they are not recorded.
 
     Examples
     --------
@@ -132,10 +142,26 @@ class Step(Generic[S]):
         # Whether there is a fusion rule, and a channel to use it.
         self.has_fusion = filter_.fusion is not None and self.channel is not None
         self.pending: tuple[Observation, ...] = ()
+        # How many observations cannot be seen from a belief, if there are any.
+        self.unseen: Array | None = None
+        self.warned: tuple[str, ...] = getattr(state, "warned", ())
+        # Sensors of changes need the beliefs about the times of their last observations.
+        self.lagged = self.times
+        self.references: References | None = None
+        sources = self.filter.change_sources if isinstance(state, SensorState) else ()
+        if sources:
+            self.references = References(state, t, observations, sources)
+            times = {*self.lagged, *self.references.times}
+            self.times = tuple(sorted(times))
         # Counted only with a gate.
         self.rejected: Array | None = None
         if filter_.gate_probability is not None:
             self.rejected = np.zeros((*self.runs, filter_.n_agents))
+        # Added up over the observations, if they are recorded.
+        self.scores: dict[str, Array] = {}
+        if filter_.record_evidence:
+            for name in ("log_likelihood", "nis", "n_observed"):
+                self.scores[name] = np.zeros((*self.runs, filter_.n_agents))
 
     # The beliefs -----------------------------------------------------------------------
 
@@ -156,6 +182,11 @@ class Step(Generic[S]):
         """Return copies of the beliefs about the earlier times, then the present forecast."""
         if not self.times:
             return [forecast]
+        if self.references is not None:
+            beliefs = dict((*self.state.references, *self.state.history))
+            if self.dt > 0:
+                beliefs[self.state.t] = self.state.belief
+            return [beliefs[t].copy() for t in self.times] + [forecast]
         # The beliefs before the step: about the earlier times, and about the state's own time,
         # which is one of the earlier ones after a forecast.
         before = [belief for _, belief in self.state.history]
@@ -190,6 +221,8 @@ class Step(Generic[S]):
             for group in group_agents(by_time[t]):
                 if self.any_failed:
                     group = group.with_target(self.keep_failed(group.target, np.nan))
+                if self.filter.periods:
+                    group.circular_model = self.filter.model
                 yield place, group
 
     def _known_observations(self) -> Known:
@@ -200,9 +233,11 @@ class Step(Generic[S]):
         # Nothing is exchanged here. A subclass may have put other agents' observations
         # into an agent's list, so a sensor is looked up at the agent that observed.
         pairs = []
-        for observations in self.observations:
+        for agent, observations in enumerate(self.observations):
             of_agent = []
             for o in observations:
+                if self.references is not None:
+                    self.references.receive(agent, o)
                 sensor = o.sensor
                 if isinstance(sensor, int):
                     sensor = f.agent_sensors[o.agent][sensor]
@@ -210,16 +245,24 @@ class Step(Generic[S]):
             pairs.append(of_agent)
         return {self.t: pairs}
 
-    def before(self, place: int, group: Received, past: list[Array]) -> Array | None:
-        """Return a group's members at the time before now, if a sensor measures changes.
+    def before(
+        self,
+        place: int,
+        group: Received,
+        past: list[Array],
+        origin: Array | None = None,
+    ) -> list[Previous] | None:
+        """Return the earlier members with which a group's sensors of changes compare, if any.
 
-        They are the last of the `past`, or those with which the step begins, if it has a length.
+        They are among the `past`, or those with which the step begins, if it has a length: the
+        state's, or `origin` if these have been resampled.
         """
-        is_present = place == len(self.times)
-        if not group.changes or not is_present or not (past or self.dt):
+        if not group.changes or self.references is None or place < len(self.times):
             return None
-        members: Array = past[-1] if past else self.state.belief
-        return members[..., group.rows, :, :]
+        start = None
+        if self.dt > 0:
+            start = self.state.t, self.state.belief if origin is None else origin
+        return self.references.find(group, past, self.times, start)
 
     def gate(
         self,
@@ -227,22 +270,75 @@ class Step(Generic[S]):
         moments: Callable[..., tuple[Array, Array]],
         predicted: Array,
         *args: Array,
+        is_torn: bool = False,
+        is_gaussian: bool = True,
+        weighted: tuple[Array, Array] | None = None,
     ) -> Received:
         """Return a group without the observations that the gate rejects, and count these.
 
         ``moments(predicted, *args)`` gives mean (*runs, G, M) and covariance (*runs, G, M, M) of
-        the predictions (*runs, G, N, M), without the observations' noise.
+        the predictions (*runs, G, N, M), without the observations' noise. With `is_torn` the
+        predictions of angles lie near the observed value, each by itself. The other observations
+        are scored, if the filter records that: their log-likelihood too, if predictions are taken
+        as Gaussian. `weighted` holds the members (*runs, G, N, d) and their weights (*runs, G, N),
+        by which likelihood sensors are predicted.
         """
-        if self.rejected is None:
+        if self.rejected is None and not self.scores:
             return group
-        # About one prediction: opposite to a wild angle the branch cut would divide them.
-        aligned = group.wrap_near(predicted.copy(), predicted[..., :1, :])
-        mean, cov = moments(aligned, *args)
-        # A filter with a gate has a probability.
-        probability = cast(float, self.filter.gate_probability)
-        group, rejected = group.gate(mean, cov, probability)
-        self.rejected[..., group.agents] += rejected
+        if is_torn and group.wraps:
+            # About one prediction, then about their mean: opposite to the observed value the
+            # branch cut would divide them.
+            predicted = group.wrap_near(predicted.copy(), predicted[..., :1, :])
+            mean, _ = moments(predicted, *args)
+            predicted = group.wrap_near(predicted, mean[..., None, :])
+        mean, cov = moments(predicted, *args)
+        # The innovation is the shorter way round.
+        mean = group.wrap_near(mean[..., None, :].copy(), group.target[..., None, :])
+        mean = mean[..., 0, :]
+        if weighted is not None and group.likelihoods:
+            has_gate = self.rejected is not None
+            mean, cov = group.insert_moments(mean, cov, *weighted, is_required=has_gate)
+        if self.rejected is not None:
+            # A filter with a gate has a probability.
+            probability = cast(float, self.filter.gate_probability)
+            group, rejected = group.gate(mean, cov, probability)
+            self.rejected[..., group.agents] += rejected
+        if self.scores:
+            self._score(group, mean, cov, is_gaussian)
         return group
+
+    def _score(
+        self, group: Received, mean: Array, cov: Array, is_gaussian: bool
+    ) -> None:
+        """Add the scores of a group's observations to those of the step."""
+        innovation = group.target - mean
+        missing = np.isnan(innovation)
+        n_observed = (~missing).sum(axis=-1)
+        # Missing numbers have a zero innovation and a unit covariance.
+        is_pair = ~missing[..., :, None] & ~missing[..., None, :]
+        unit = np.eye(innovation.shape[-1])
+        innovation_cov = np.where(is_pair, cov + group.noise, unit)
+        innovation = np.where(missing, 0.0, innovation)
+
+        def compute(r: Array, s: Array, *_: Any) -> tuple[Array, ...]:
+            # ε = rᵀ S⁻¹ r, and log det S
+            lower = cholesky(s)
+            return quadratic_form(lower, r), log_det(lower)
+
+        zero = np.zeros(innovation.shape[:-1])
+        nis, log_volume = self.apply(
+            compute, (innovation, innovation_cov), (zero, zero), group.agents
+        )
+        self.scores["nis"][..., group.agents] += nis
+        self.scores["n_observed"][..., group.agents] += n_observed
+        if is_gaussian:
+            # log N(r; 0, S)
+            log_density = -0.5 * (nis + log_volume + n_observed * _LOG_2PI)
+            self.add_log_likelihood(log_density, group.agents)
+
+    def add_log_likelihood(self, values: Array, agents: Any) -> None:
+        """Add values (*runs, G) to the recorded log-likelihood of these agents' observations."""
+        self.scores["log_likelihood"][..., agents] += values
 
     # Failures --------------------------------------------------------------------------
 
@@ -378,16 +474,70 @@ class Step(Generic[S]):
         state = self.state
         if isinstance(state, SensorState):
             # A family may keep its past in its own form; otherwise it is (time, belief) pairs.
+            pairs = tuple(zip(self.times, past, strict=False))
             if "history" not in belief:
-                belief["history"] = tuple(zip(self.times, past, strict=True))
+                history = [pair for pair in pairs if pair[0] in self.lagged]
+                belief["history"] = tuple(history)
+            belief |= self._describe_observations(state, pairs)
             belief["failed"] = self.failed
             belief["pending"] = self.pending
         # The messages in the step are in the channel's ledger.
         ledger = state.ledger if self.channel is None else self.channel.ledger
+        # A failed run has no score.
+        for name, values in self.scores.items():
+            self.scores[name] = self.keep_failed(values, np.nan)
         new: S = type(state).construct(
-            self.t, ledger, self.rng, rejected=self.rejected, **belief
+            self.t, ledger, self.rng, rejected=self.rejected, **self.scores, **belief
         )
         return new
+
+    def _describe_observations(
+        self, state: SensorState, past: tuple[tuple[float, Array], ...]
+    ) -> dict[str, Any]:
+        """Return the state's fields about the observations."""
+        kept_times = (*self.lagged, self.t)
+        fields: dict[str, Any] = {
+            "assimilated": note_assimilated(
+                self.observations, self.delayed, state.assimilated, kept_times
+            ),
+            "unseen": self.unseen,
+            "warned": self.warned,
+        }
+        if self.references is not None:
+            needed = self.references.kept
+            fields["last_changes"] = self.references.last_changes
+            fields["references"] = tuple(
+                [(t, x) for t, x in past if t in needed and t not in self.lagged]
+            )
+        return fields
+
+    # What is said once ----------------------------------------------------------------
+
+    def warn_once(self, key: str, text: str) -> None:
+        """Warn, unless this state or one before it has led to the same warning."""
+        if key in self.warned:
+            return
+        self.warned = (*self.warned, key)
+        warnings.warn(text, RuntimeWarning, stacklevel=4)
+
+    def note_unseen(self, group: Received, is_unseen: Mask, reason: str) -> None:
+        """Count the observed numbers (*runs, G, M) that no update can use, and say so once."""
+        is_unseen = is_unseen & ~np.isnan(group.target)
+        if not is_unseen.any():
+            return
+        if self.unseen is None:
+            self.unseen = np.zeros((*self.runs, self.filter.n_agents))
+        # Numbers of one sensor are one observation.
+        for k in range(int(group.sensor_index.max()) + 1):
+            of_sensor = is_unseen & (group.sensor_index == k)
+            self.unseen[..., group.agents] += of_sensor.any(axis=-1)
+        *_, g, column = np.argwhere(is_unseen)[0].tolist()
+        self.warn_once(
+            "unseen",
+            f"observations must be predicted to be used, but {reason}: agent "
+            f"{group.agents[g]} left out one of kind {group.kind_of(g, column)!r} at t = "
+            f"{format_number(self.t)} s; the record counts them as unseen",
+        )
 
 
 class _Part(NamedTuple):
@@ -398,6 +548,14 @@ class _Part(NamedTuple):
     """Places of these agents in the group, or a slice if all have it."""
     cells: tuple[Any, Any]
     """Index of the sensor's numbers in arrays (G, M)."""
+
+
+def _block_of(part: _Part) -> tuple[Any, ...]:
+    """Return the index of a sensor's block in covariances (*runs, G, M, M)."""
+    rows, columns = part.cells
+    if isinstance(rows, slice):
+        return (..., rows, columns, columns)
+    return (..., rows[..., None], columns[..., :, None], columns[..., None, :])
 
 
 class Received:
@@ -456,7 +614,13 @@ class Received:
         self.noise = self._assemble_noise(starts)
         self.linear = all(sensor.linear is not None for sensor in starts)
         self.changes = any(sensor.uses_previous for sensor in starts)
-        self.wraps = any(sensor.residual_function is not None for sensor in starts)
+        self.wraps = any(sensor.wraps for sensor in starts)
+        # The sensors that are likelihoods: their numbers are not predicted.
+        self.likelihoods = [
+            part for part in self.parts if isinstance(part.sensor, LikelihoodSensor)
+        ]
+        # The model, if it has circular components.
+        self.circular_model: Model | None = None
         self._matrices: dict[int, Array] = {}
         self._checked: set[Sensor] = set()
 
@@ -473,10 +637,34 @@ class Received:
         n, size = self.sensor_index.shape
         noise = np.zeros((n, size, size))
         for sensor, places in starts.items():
+            if isinstance(sensor, LikelihoodSensor):
+                continue
             for g, start in places:
                 block = slice(start, start + sensor.dim)
                 noise[g, block, block] = sensor.noise_cov
         return noise[0] if (noise == noise[:1]).all() else noise
+
+    @property
+    def has_same_sensors(self) -> bool:
+        """Whether all agents of the group have the same sensors, in the same order."""
+        n_agents = len(self.agents)
+        for part in self.parts:
+            if isinstance(part.agents, slice):
+                continue
+            # A sensor that an agent has twice is listed twice.
+            _, columns = part.cells
+            firsts = np.unique(columns[:, 0])
+            if len(part.agents) != n_agents * len(firsts):
+                return False
+        return True
+
+    def collect(self, function: Callable[[Sensor], Array]) -> Array:
+        """Return values (dim, k) of each sensor for all numbers of the group, (G, M, k)."""
+        values = [np.asarray(function(part.sensor)) for part in self.parts]
+        result = np.empty((*self.sensor_index.shape, values[0].shape[-1]))
+        for part, value in zip(self.parts, values, strict=True):
+            result[part.cells] = value
+        return result
 
     def H(self, dim: int) -> Array:
         """Return the matrices of linear sensors one below the other, (G, M, d), made once."""
@@ -487,6 +675,69 @@ class Received:
             self._matrices[dim] = matrix
         return self._matrices[dim]
 
+    def kind_of(self, g: int, column: int) -> str:
+        """Return the kind of the sensor that a number of the g-th agent belongs to."""
+        owners = np.zeros(self.sensor_index.shape, dtype=np.intp)
+        for k, part in enumerate(self.parts):
+            owners[part.cells] = k
+        return self.parts[owners[g, column]].sensor.kind
+
+    def log_likelihood(self, states: Array) -> tuple[Received, Array | float]:
+        """Return the log-likelihoods of states (*runs, G, N, d) by sensors that are likelihoods.
+
+        They are (*runs, G, N), and come behind the group without these sensors' observations.
+        """
+        if not self.likelihoods:
+            return self, 0.0
+        logs = np.zeros(states.shape[:-1])
+        target = self.target.copy()
+        for part in self.likelihoods:
+            sensor = cast(LikelihoodSensor, part.sensor)
+            observed = target[(..., *part.cells)]
+            members = states[..., part.agents, :, :]
+            values = sensor.evaluate(members, observed[..., None, :])
+            # An agent may have several observations of one sensor.
+            np.add.at(logs, (..., part.agents, slice(None)), values)
+        rest = self.with_target(target)
+        # The missing numbers get a unit variance, so that R has an inverse.
+        rest.noise = np.array(
+            np.broadcast_to(self.noise, (*target.shape[-2:], target.shape[-1]))
+        )
+        for part in self.likelihoods:
+            target[(..., *part.cells)] = np.nan
+            rest.noise[_block_of(part)] = np.eye(part.sensor.dim)
+        return rest, logs
+
+    def insert_moments(
+        self,
+        mean: Array,
+        cov: Array,
+        states: Array,
+        weights: Array,
+        *,
+        is_required: bool,
+    ) -> tuple[Array, Array]:
+        """Return moments of the predictions with those of likelihood sensors put in.
+
+        Unless they are required, the numbers of a sensor without moments are NaN.
+        """
+        mean = mean.copy()
+        cov = cov.copy()
+        for part in self.likelihoods:
+            sensor = cast(LikelihoodSensor, part.sensor)
+            if sensor.moments is None and not is_required:
+                mean[(..., *part.cells)] = np.nan
+                continue
+            means, covs = sensor.predict_moments(states[..., part.agents, :, :])
+            # E[y] = Σ wᵢ mᵢ and Cov[y] = Σ wᵢ (Rᵢ + (mᵢ - E[y]) (mᵢ - E[y])ᵀ)
+            w = weights[..., part.agents, :]
+            centre = np.einsum("...n,...nm->...m", w, means)
+            anomalies = means - centre[..., None, :]
+            covs = covs + anomalies[..., :, None] * anomalies[..., None, :]
+            mean[(..., *part.cells)] = centre
+            cov[_block_of(part)] = np.einsum("...n,...nij->...ij", w, covs)
+        return mean, cov
+
     def with_target(self, target: Array) -> Received:
         """Return the same group with these observed values."""
         # The plan is shared: only the values differ from step to step.
@@ -495,42 +746,96 @@ class Received:
         return result
 
     def predict(
-        self, states: Array, previous: Array | None = None, same_branch: bool = False
+        self,
+        states: Array,
+        previous: list[Previous] | Array | None = None,
+        *,
+        branch: Literal["mean", "first", "each"] = "mean",
     ) -> Array:
         """Predict the observations of states (*runs, G, N, d) without noise, (*runs, G, N, M).
 
-        Angles lie on the branch of the observed value; with `same_branch` the first state's do,
-        and those of the other states lie on its branch. `previous` holds the states at the
-        observation time before, for sensors that measure changes.
+        Angles are brought onto one branch about the prediction of the states' mean, and then all
+        together onto the branch of the observed value that is nearest to their mean, or, with
+        ``"first"``, to that of the first state. With ``"each"`` every prediction is brought near
+        the observed value by itself, as likelihoods need it. `previous` holds the states at the
+        time that a sensor of changes compares with, or several such times.
         """
+        if isinstance(previous, list):
+            return self._predict_changes(states, previous, branch)
+        if self.circular_model is not None:
+            self._check_sensors(self.circular_model, states, previous)
         if self.linear:
             # y = x Hᵀ; a contiguous copy multiplies faster than a transposed view.
-            return np.asarray(
+            result = np.asarray(
                 states @ np.ascontiguousarray(self.H(states.shape[-1]).mT)
             )
+            # A linear prediction runs on, so that no cut divides it.
+            return self._place(result, branch) if self.wraps else result
         n_states = states.shape[-2]
         # Numbers before states, so that the cells of a sensor are one index.
         result = np.empty((*states.shape[:-2], self.target.shape[-1], n_states))
         for part in self.parts:
             # Only sensors that measure a change need the previous states.
             before = None if previous is None else previous[..., part.agents, :, :]
-            values = self._predict_part(part, states[..., part.agents, :, :], before)
+            of_agents = states[..., part.agents, :, :]
+            values = self._predict_part(part, of_agents, before)
+            if part.sensor.wraps and branch != "each":
+                values = _gather_predictions(part.sensor, values, of_agents, before)
             result[(..., *part.cells, slice(None))] = values.swapaxes(-1, -2)
         result = np.ascontiguousarray(result.swapaxes(-1, -2))
         if np.isinf(result).any():
             raise ValueError(
                 "predicted must have finite numbers or NaN (missing), got infinity"
             )
-        if not self.wraps:
-            return result
-        result = self.wrap_near(result, self.target[..., None, :])
-        return self.wrap_near(result, result[..., :1, :]) if same_branch else result
+        return self._place(result, branch) if self.wraps else result
+
+    def _predict_changes(
+        self,
+        states: Array,
+        previous: list[Previous],
+        branch: Literal["mean", "first", "each"],
+    ) -> Array:
+        """Predict where each number is compared with the earlier states of a time of its own."""
+        result: Array | None = None
+        for members, cells in previous:
+            predicted = self.predict(states, members, branch=branch)
+            if result is None:
+                result = predicted
+            else:
+                result = np.where(cells[..., None, :], predicted, result)
+        return cast(Array, result)
+
+    def _place(self, predicted: Array, branch: str) -> Array:
+        """Bring predictions near the observed value: each, or all by the same periods."""
+        target = self.target[..., None, :]
+        if branch == "each":
+            return self.wrap_near(predicted, target)
+        centre = predicted[..., :1, :]
+        if branch == "mean":
+            centre = predicted.mean(axis=-2, keepdims=True)
+        shift = self.wrap_near(centre.copy(), target) - centre
+        # Exactly zero where nothing turns; NaN where some state cannot be seen.
+        if not np.count_nonzero(shift):
+            return predicted
+        return np.asarray(predicted + np.where(np.isnan(shift), 0.0, shift))
+
+    def _check_sensors(
+        self, model: Model, states: Array, previous: Array | None
+    ) -> None:
+        """Refuse sensors without a period that change when a circular component turns once."""
+        for part in self.parts:
+            rows = (..., part.agents, slice(None), slice(None))
+            before = None if previous is None else previous[rows]
+            check_sensor(part.sensor, model, states[rows], before)
 
     def _predict_part(
         self, part: _Part, states: Array, previous: Array | None
     ) -> Array:
         """Predict with one sensor; its function is called directly once it has been checked."""
         sensor = part.sensor
+        if isinstance(sensor, LikelihoodSensor):
+            # Nothing is compared with it: see `log_likelihood`.
+            return np.zeros((*states.shape[:-1], sensor.dim))
         if sensor in self._checked:
             # A copy, since the user's function may work in place.
             values = np.asarray(call_user(sensor.h, states.copy()), dtype=np.float64)
@@ -550,15 +855,12 @@ class Received:
         full = (reference + 0 * predicted).swapaxes(-1, -2)
         for part in self.parts:
             # A difference that does not wrap has one branch.
-            if part.sensor.residual_function is None:
+            if not part.sensor.wraps:
                 continue
             index = (..., *part.cells, slice(None))
             ours = values[index].swapaxes(-1, -2)
             aim = full[index].swapaxes(-1, -2)
-            # y* - r(y*, h) is h on the branch of y*, where r wraps the difference.
-            residual = part.sensor.residual(aim, ours)
-            wrapped = np.where(np.isnan(residual), ours, aim - residual)
-            values[index] = wrapped.swapaxes(-1, -2)
+            values[index] = part.sensor.bring_near(ours, aim).swapaxes(-1, -2)
         return predicted
 
     def jacobian(self, states: Array, std: Array | None = None) -> Array:
@@ -622,6 +924,41 @@ class Received:
             target = np.where(present & is_outlier[..., None], np.nan, target)
             rejected += is_outlier
         return self.with_target(target), rejected
+
+
+def predict_points(sensor: Sensor, states: Array) -> Array:
+    """Predict a sensor's observations of points (..., N, d), angles on one branch, (..., N, m).
+
+    >>> from distfilt.sensors import bearing
+    >>> points = np.array([[-1.0, 0.1], [-1.0, -0.1]])
+    >>> predict_points(bearing([0, 1], std=0.1), points).ravel().round(4)
+    array([3.0419, 3.2413])
+    """
+    return _gather_predictions(sensor, sensor.predict(states), states, None)
+
+
+def _gather_predictions(
+    sensor: Sensor, values: Array, states: Array, previous: Array | None
+) -> Array:
+    """Bring a sensor's predictions (*runs, G, N, m) of states (*runs, G, N, d) onto one branch."""
+    if values.shape[-2] == 1:
+        return values
+    mean = states.mean(axis=-2, keepdims=True)
+    previous_mean = None
+    if sensor.uses_previous and previous is not None:
+        previous_mean = previous.mean(axis=-2, keepdims=True)
+
+    def fallback() -> Array:
+        return sensor.predict(mean, previous_mean)
+
+    def tangent() -> Array | None:
+        if sensor.uses_previous:
+            return None
+        # h(m) + H (x_i - m)
+        slope = sensor.jacobian(mean[..., 0, :])
+        return np.asarray(fallback() + (states - mean) @ slope.mT)
+
+    return gather(values, sensor.bring_near, tangent, fallback)
 
 
 @lru_cache(maxsize=32)

@@ -14,6 +14,7 @@ from ..linalg import (
     cholesky,
     log_det,
     solve_lower,
+    solve_semidefinite,
     solve_upper,
     symmetrise,
 )
@@ -26,8 +27,10 @@ from ..validation import (
     Mask,
     PositiveDefinite,
     PositiveSemidefinite,
+    format_number,
     validated,
 )
+from ..validation.clocks import warn_of_clock
 
 __all__ = ["FilterResult", "kalman_filter", "rts_smoother"]
 
@@ -76,7 +79,7 @@ class FilterResult(FrozenModel):
 @validated
 def kalman_filter(
     mean: MeanVector,
-    cov: PositiveDefinite,
+    cov: PositiveSemidefinite,
     observations: ObservationSeries,
     *,
     F: SquareMatrix,
@@ -95,7 +98,7 @@ def kalman_filter(
     mean : array_like, (d,) or (..., d)
         Prior mean, one step before the first observation.
     cov : array_like, (d, d) or (..., d, d)
-        Prior covariance, positive definite.
+        Prior covariance, positive semidefinite: a known constant has a variance of zero.
     observations : array_like, (T, ..., m)
         Observations; the middle axes are the runs. NaN marks a missing component: the result is
         the same as with its row deleted from H and R.
@@ -250,7 +253,7 @@ def rts_smoother(
         # G = P Fᵀ (F P Fᵀ + Q)⁻¹, by a solve instead of an inverse
         cross = f[k + 1] @ p
         forecast_cov = symmetrise(cross @ f[k + 1].T + q[k + 1])
-        gain = np.linalg.solve(forecast_cov, cross).mT
+        gain = solve_semidefinite(forecast_cov, cross).mT
         # xˢ = x + G (xˢ' - F x), with the smoothed state one step later
         difference = means[k + 1] - x @ f[k + 1].T
         means[k] = x + (gain @ difference[..., None])[..., 0]
@@ -321,5 +324,6 @@ def prepend_prior_time(times: Array, observations: Array, sensor: Sensor) -> Arr
             f"got {observations.shape}"
         )
     if times.min(initial=np.inf) <= 0:
-        raise ValueError(f"times must be after 0, got {times[0]:g}")
+        raise ValueError(f"times must be after 0, got {format_number(times[0])}")
+    warn_of_clock(0.0, times, "times")
     return np.concatenate([[0.0], times])

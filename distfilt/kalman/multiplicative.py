@@ -6,9 +6,11 @@ error of an attitude, and no uncertainty of the quaternion's length.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from functools import partial
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -25,6 +27,7 @@ from ..validation import (
     PositiveDefinite,
     PositiveInt,
     Times,
+    format_number,
     validated,
 )
 from .linear import (
@@ -159,8 +162,9 @@ def mekf(
     model : Model
         Linearised about each analysis mean.
     sensors : sequence of Sensor
-        Linearised about each forecast mean. Sensors of increments are supported: the errors of the
-        previous state are appended to those of the present one for the analysis.
+        Linearised about each forecast mean. Sensors of increments are supported: each compares
+        with the state at its own last observation that is not missing (NaN), whose errors are
+        appended to those of the present one.
     times : array_like, (T,)
         Observation times after 0, in s.
 
@@ -201,79 +205,164 @@ def mekf(
     # Each step begins at the time of the last observation, the first at 0.
     clock = prepend_prior_time(times, observations, sensor)
     runs, y, x, p = flatten_runs(mean, cov, observations)
+    k = chart.error_dim
     means = np.empty((len(y), *x.shape))
     covs = np.empty((len(y), *p.shape))
     log_likelihood = np.empty(y.shape[:2])
+    parts = _list_parts(sensors, y)
+    # Each sensor of increments compares with the start before its first observation.
+    changes = [part for part in parts if part.sensor.uses_previous]
+    previous = [x] * len(changes)
+    p = np.tile(p, (1, 1 + len(changes), 1 + len(changes)))
+    has_unseen = False
     for n, t in enumerate(times):
         dt = t - clock[n]
         try:
-            forecast, joint, previous = _predict(
-                x, p, chart, model, sensor, clock[n], dt
-            )
-            x, p, log_likelihood[n] = _assimilate(
-                forecast, joint, previous, y[n], chart, sensor
+            forecast, joint = _predict(x, p, chart, model, clock[n], dt)
+            innovation = _find_innovation(forecast, previous, y[n], parts, sensor)
+            has_unseen |= bool((np.isnan(innovation) & ~np.isnan(y[n])).any())
+            slope = _error_jacobian(forecast, joint, previous, parts, chart)
+            x, previous, p, log_likelihood[n] = _assimilate(
+                forecast, joint, previous, innovation, slope, chart, sensor
             )
         except np.linalg.LinAlgError as error:
-            raise np.linalg.LinAlgError(f"at t = {t:g}: {error}") from None
+            raise np.linalg.LinAlgError(f"at t = {format_number(t)}: {error}") from None
         means[n] = x
-        covs[n] = p
+        covs[n] = p[:, :k, :k]
+        previous, p = _renew(x, previous, p, y[n], changes)
+    if has_unseen:
+        warnings.warn(
+            "observations must be predicted to be used, but a sensor cannot see from a mean "
+            "(its prediction is NaN): these components are left out",
+            RuntimeWarning,
+            stacklevel=3,
+        )
     return unflatten_runs(means, covs, log_likelihood, runs)
 
 
-def _predict(
-    x: Array,
-    p: Array,
-    chart: QuaternionChart,
-    model: Model,
-    sensor: Sensor,
-    t: float,
-    dt: float,
-) -> tuple[Array, Array, Array | None]:
-    """Forecast means (R, d) and covariances of their errors, and the previous means.
+class _Part(NamedTuple):
+    """A sensor, which of its numbers are meant, and where they stand among the observations."""
 
-    For a sensor of increments the covariances are joint, of the present and the previous errors,
-    (R, 2k, 2k); otherwise they are (R, k, k) and there are no previous means.
+    sensor: Sensor
+    rows: slice
+    columns: slice
+
+
+def _list_parts(sensors: Sequence[Sensor], y: Array) -> list[_Part]:
+    """Return the sensors with their columns; those of a stack one by one.
+
+    A sensor of increments whose components are not all missing together is several parts, which
+    compare with states of different times.
     """
+    parts: list[_Part] = []
+    waiting = list(sensors)
+    start = 0
+    while waiting:
+        sensor = waiting.pop(0)
+        if sensor.kind == "stack" and isinstance(sensor.h, partial):
+            waiting = [*sensor.h.keywords["sensors"], *waiting]
+            continue
+        n = sensor.dim
+        present = ~np.isnan(y[..., start : start + n])
+        is_split = (present != present[..., :1]).any() and sensor.uses_previous
+        size = 1 if is_split else n
+        for row in range(0, n, size):
+            rows = slice(row, row + size)
+            columns = slice(start + row, start + row + size)
+            parts.append(_Part(sensor, rows, columns))
+        start += n
+    return parts
+
+
+def _predict(
+    x: Array, p: Array, chart: QuaternionChart, model: Model, t: float, dt: float
+) -> tuple[Array, Array]:
+    """Forecast means (R, d) and covariances of their errors, (R, K, K).
+
+    Behind the k present errors stand those of the states with which sensors of increments compare.
+    """
+    k = chart.error_dim
     forecast = model.step(x, t, dt)
     _check_finite(forecast)
     projection = chart.tangent_projection(forecast)
     # Transition of the errors: A = B(x')⁺ J B(x)
     basis = chart.tangent_basis(x)
+    present = p[:, :k, :k]
     # Standard deviations of the state, from those of its error
-    std = deviations(basis @ p @ basis.mT)
+    std = deviations(basis @ present @ basis.mT)
     a = projection @ model.jacobian(x, t, dt, std=std) @ basis
     noise_cov = projection @ model.Q(t, dt) @ projection.mT
-    cov = a @ p @ a.mT + noise_cov
-    if not sensor.uses_previous:
-        return forecast, cov, None
-    # The covariance of present and previous errors is A P.
-    cross = a @ p
-    return forecast, np.block([[cov, cross], [cross.mT, p]]), x
+    cov = a @ present @ a.mT + noise_cov
+    if p.shape[-1] == k:
+        return forecast, cov
+    # The covariance of present and earlier errors is A P.
+    cross = a @ p[:, :k, k:]
+    return forecast, np.block([[cov, cross], [cross.mT, p[:, k:, k:]]])
+
+
+def _find_innovation(
+    forecast: Array,
+    previous: list[Array],
+    y: Array,
+    parts: list[_Part],
+    sensor: Sensor,
+) -> Array:
+    """Return the observations minus their predictions, (R, m)."""
+    earlier = iter(previous)
+    predicted = []
+    for part in parts:
+        before = next(earlier) if part.sensor.uses_previous else None
+        values = part.sensor.predict(forecast, before)
+        predicted.append(values[..., part.rows])
+    return sensor.residual(y, np.concatenate(predicted, axis=-1))
 
 
 def _assimilate(
     forecast: Array,
     cov: Array,
-    previous: Array | None,
-    y: Array,
+    previous: list[Array],
+    innovation: Array,
+    slope: Array,
     chart: QuaternionChart,
     sensor: Sensor,
-) -> tuple[Array, Array, Array]:
-    """Analysis means (R, d), covariances (R, k, k), and log densities (R,) of observations."""
-    innovation = sensor.residual(y, sensor.predict(forecast, previous))
+) -> tuple[Array, list[Array], Array, Array]:
+    """Analysis means (R, d), earlier means, covariances, and log densities (R,)."""
     missing = np.isnan(innovation)
     # Missing components have no innovation and no row in H.
     innovation = np.where(missing, 0.0, innovation)
-    h = _error_jacobian(forecast, cov, previous, sensor, chart)
-    h = np.where(missing[..., None], 0.0, h)
+    h = np.where(missing[..., None], 0.0, slope)
     error, cov, log_density = assimilate(
         cov, innovation[..., None], h, sensor.noise_cov, missing
     )
-    # The previous errors, if any, come last and are dropped.
     k = chart.error_dim
     x = chart.retract(forecast, error[:, :k, 0])
     _check_finite(x)
-    return x, cov[:, :k, :k], log_density[:, 0]
+    earlier = []
+    for j, mean in enumerate(previous, start=1):
+        # The earlier states are conditioned too.
+        earlier.append(chart.retract(mean, error[:, j * k : (j + 1) * k, 0]))
+    return x, earlier, cov, log_density[:, 0]
+
+
+def _renew(
+    x: Array, previous: list[Array], p: Array, y: Array, changes: list[_Part]
+) -> tuple[list[Array], Array]:
+    """Let sensors of increments that have observed compare with the present state from now on."""
+    if not changes:
+        return previous, p
+    k = p.shape[-1] // (1 + len(changes))
+    n_runs = len(x)
+    # For each run, which errors take the places of the earlier ones.
+    index = np.tile(np.arange(p.shape[-1]), (n_runs, 1))
+    renewed = []
+    for j, part in enumerate(changes, start=1):
+        present = ~np.isnan(y[:, part.columns])
+        # All components or none.
+        is_observed = present[:, 0]
+        index[is_observed, j * k : (j + 1) * k] = np.arange(k)
+        renewed.append(np.where(is_observed[:, None], x, previous[j - 1]))
+    rows = np.arange(n_runs)[:, None, None]
+    return renewed, p[rows, index[:, :, None], index[:, None, :]]
 
 
 def _check_finite(x: Array) -> None:
@@ -285,22 +374,37 @@ def _check_finite(x: Array) -> None:
 def _error_jacobian(
     x: Array,
     cov: Array,
-    previous: Array | None,
-    sensor: Sensor,
+    previous: list[Array],
+    parts: list[_Part],
     chart: QuaternionChart,
 ) -> Array:
-    """Derivative of a sensor in the errors, (R, m, k); (R, m, 2k) with those of previous states."""
+    """Derivative of the observations in the present and the earlier errors, (R, m, K)."""
     basis = chart.tangent_basis(x)
     # The present errors come first in a joint covariance.
     k = chart.error_dim
     std = deviations(basis @ cov[..., :k, :k] @ basis.mT)
-    h = sensor.jacobian(x, previous, std=std) @ basis
-    if previous is None:
-        return np.asarray(h)
+    slope = np.zeros((len(x), parts[-1].columns.stop, cov.shape[-1]))
+    j = 0
+    for sensor, rows, columns in parts:
+        before = previous[j] if sensor.uses_previous else None
+        present = sensor.jacobian(x, before, std=std) @ basis
+        slope[:, columns, :k] = present[:, rows]
+        if before is None:
+            continue
+        j += 1
+        block = slice(j * k, (j + 1) * k)
+        earlier = _earlier_jacobian(sensor, x, before, chart)
+        slope[:, columns, block] = earlier[:, rows]
+    return slope
+
+
+def _earlier_jacobian(
+    sensor: Sensor, x: Array, previous: Array, chart: QuaternionChart
+) -> Array:
+    """Derivative of a sensor of increments in the errors of the earlier states, (R, m, k)."""
 
     def predict(varied: Array) -> Array:
         return sensor.predict(np.broadcast_to(x[:, None], varied.shape), varied)
 
     slope = central_difference(predict, previous, difference=sensor.residual)
-    h_previous = slope @ chart.tangent_basis(previous)
-    return np.concatenate([h, h_previous], axis=-1)
+    return np.asarray(slope @ chart.tangent_basis(previous))

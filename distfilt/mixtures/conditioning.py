@@ -63,6 +63,7 @@ def update_mixture(
     noise: Array,
     *,
     residual: Callable[[Array, Array], Array] = np.subtract,
+    on_branch: bool = False,
 ) -> GaussianMixture:
     """Condition a mixture on an observation: each component, and the weights by its likelihood.
 
@@ -80,6 +81,8 @@ def update_mixture(
         Covariance of its noise.
     residual : callable
         ``residual(a, b)``, for observations that wrap.
+    on_branch : bool
+        Whether `function` returns the angles of points (L, N, d) on one branch by itself.
 
     Raises
     ------
@@ -96,7 +99,7 @@ def update_mixture(
     if np.isnan(observed).all():
         return mixture
     innovations, first, second, noise_factor = _innovations(
-        mixture, observed, function, noise, residual
+        mixture, observed, function, noise, residual, on_branch
     )
     # S = C Cᵀ with the columns C = [first, second, noise], as a triangular root.
     root = _combine_roots(first, second, noise_factor)
@@ -131,12 +134,13 @@ def within_gate(
     *,
     gate: float,
     residual: Callable[[Array, Array], Array] = np.subtract,
+    on_branch: bool = False,
 ) -> Array:
     """Return the observation, or NaN in its place if it lies outside every component's gate.
 
     Parameters
     ----------
-    mixture, observed, function, noise, residual
+    mixture, observed, function, noise, residual, on_branch
         As of :func:`update_mixture`.
     gate : float
         How many standard deviations the observation may lie from the nearest component's
@@ -152,7 +156,7 @@ def within_gate(
     [array([nan]), array([9.5])]
     """
     innovations, first, second, noise_factor = _innovations(
-        mixture, observed, function, noise, residual
+        mixture, observed, function, noise, residual, on_branch
     )
     root = _combine_roots(first, second, noise_factor)
     squared_distances = quadratic_form(root, innovations)
@@ -170,6 +174,7 @@ def _innovations(
     function: Callable[[Array], Array],
     noise: Array,
     residual: Callable[[Array, Array], Array],
+    on_branch: bool,
 ) -> tuple[Array, Array, Array, Array]:
     """Innovations of the k observed components, and roots of their covariances.
 
@@ -190,7 +195,8 @@ def _innovations(
     # Relative to the prediction at the mean, so that angles do not wrap between points.
     at_mean = predicted[:, 0]
     at_means = np.broadcast_to(at_mean[:, None], predicted.shape)
-    relative = call_user(residual, predicted, at_means)[..., present]
+    compare = np.subtract if on_branch else residual
+    relative = call_user(compare, predicted, at_means)[..., present]
     mean, first, second = _divided_differences(relative)
     difference = call_user(residual, np.broadcast_to(y, at_mean.shape), at_mean)
     innovations = difference[..., present] - mean

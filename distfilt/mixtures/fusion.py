@@ -9,7 +9,8 @@ import numpy as np
 
 from ..linalg import log_sum_exp
 from ..network import Channel, fusion_rule
-from ..validation import PositiveInt, UnitInterval, call_user, validated
+from ..periods import Periods, align
+from ..validation import Array, PositiveInt, UnitInterval, call_user, validated
 from .gaussian import GaussianMixture, assemble_joint, regression
 from .partial_fusion import Exponents, Others, PartialFusion, Rule, Terms
 from .reduction import runnalls
@@ -178,6 +179,16 @@ def average_mixtures(
     )
 
 
+def align_mixture(
+    mixture: GaussianMixture, reference: Array, periods: Periods
+) -> GaussianMixture:
+    """Bring the means of a mixture's components onto the branch of a reference (d,)."""
+    means = align(mixture.means, reference, periods)
+    if means is mixture.means:
+        return mixture
+    return GaussianMixture.construct(mixture.weights, means, mixture.covs)
+
+
 @fusion_rule("mixtures")
 @validated
 def target_fusion(
@@ -222,12 +233,16 @@ def target_fusion(
     [[[1.5]], [[1.5]]]
     """
     indices = range(target_dim)
+    periods = channel.periods[:target_dim]
     messages = [belief.marginal(indices).pack() for belief in beliefs]
     fused = list(beliefs)
     for agent, payloads in enumerate(channel.broadcast(messages)):
         try:
             if payloads:
                 received = [GaussianMixture.unpack(p) for p in payloads.values()]
+                # Angles on the branch of the receiver's.
+                mean = fused[agent].mean[:target_dim]
+                received = [align_mixture(m, mean, periods) for m in received]
                 fused[agent] = call_user(fuse, fused[agent], received)
             # A covariance without a Cholesky factor is an error of this agent.
             fused[agent].factors  # noqa: B018

@@ -7,12 +7,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from typing import Annotated
+from typing import Annotated, cast
 
 import numpy as np
 
 from ..derivatives import difference_with_error, evaluate_derivative
 from ..linalg import factor
+from ..periods import Periods, PeriodsArgument, read_periods, wrap_differences
 from ..validation import (
     Array,
     ArrayInput,
@@ -26,9 +27,12 @@ from ..validation import (
     call_user,
     check_array,
     check_positive_semidefinite,
+    check_signature,
+    format_number,
     is_first_use,
     validated,
 )
+from ..validation.clocks import warn_of_clock
 
 __all__ = ["LinearModel", "Model", "simulate"]
 
@@ -59,12 +63,26 @@ class Model(FrozenModel):
         Name of each component, for labels.
     units : tuple of str, optional
         Unit of each component.
+    periods : sequence of (float or None), or mapping, optional
+        The period of each circular component, such as 2π for a heading in rad, and None for the
+        others; or a mapping of components, by index or name, to periods. Filters then treat
+        states that differ by a period as the same: the book's page *Angles, headings,
+        attitudes* says how. Whether `transition` wraps or runs on makes no difference.
 
     Examples
     --------
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
     >>> walk.Q(0.0, 0.5)
     array([[0.5]])
+    >>> turn = Model(
+    ...     2,
+    ...     lambda x, t, dt: x + [0.1 * dt, 0.0],
+    ...     lambda t, dt: dt * np.eye(2),
+    ...     names=("heading", "speed"),
+    ...     periods={"heading": 2 * np.pi},
+    ... )
+    >>> turn.periods == (2 * np.pi, None)
+    True
     """
 
     dim: PositiveInt
@@ -75,9 +93,16 @@ class Model(FrozenModel):
     )
     names: tuple[str, ...] = field(default=(), kw_only=True)
     units: tuple[str, ...] = field(default=(), kw_only=True)
+    periods: PeriodsArgument = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        periods = read_periods(self.periods, self.dim, self.names)
+        object.__setattr__(self, "periods", periods)
+        check_signature(self.transition, "transition", "x, t, dt")
+        check_signature(self.noise_cov, "noise_cov", "t, dt")
+        if self.derivative is not None:
+            check_signature(self.derivative, "derivative", "x, t, dt")
         # Labels are optional, but complete if given.
         for name, labels in (("names", self.names), ("units", self.units)):
             if labels and len(labels) != self.dim:
@@ -91,6 +116,10 @@ class Model(FrozenModel):
     ) -> Array:
         """Move states (..., d) from `t` to `t` + `dt`, without noise."""
         return call_batched(self, "transition", (x,), t, dt)
+
+    def _subtract(self, ahead: Array, behind: Array) -> Array:
+        """Return differences of states, of circular components the shorter way round."""
+        return wrap_differences(ahead - behind, cast(Periods, self.periods))
 
     @validated
     def Q(self, t: float, dt: NonNegativeFloat) -> Array:
@@ -153,7 +182,8 @@ class Model(FrozenModel):
         def move(states: Array) -> Array:
             return self.step(states, t, dt)
 
-        differences = partial(difference_with_error, move, x, scale=std)
+        difference = self._subtract if self.periods else np.subtract
+        differences = partial(difference_with_error, move, x, difference, scale=std)
         shape = (*x.shape, self.dim)
         return evaluate_derivative(
             self,
@@ -213,6 +243,7 @@ class LinearModel(Model):
         *,
         names: tuple[str, ...] = (),
         units: tuple[str, ...] = (),
+        periods: PeriodsArgument = (),
         time_invariant: bool = False,
     ) -> LinearModel:
         """Build the model from its transition matrix, ``transition_matrix(dt) -> (d, d)``."""
@@ -222,6 +253,7 @@ class LinearModel(Model):
             noise_cov,
             names=names,
             units=units,
+            periods=periods,
             transition_matrix=transition_matrix,
             time_invariant=time_invariant,
         )
@@ -357,7 +389,10 @@ def trajectory(
 ) -> Array:
     """States at the times, from `x` at `t0` by ``step(x, t, dt)``."""
     if times.size and times[0] <= t0:
-        raise ValueError(f"times must be after t0 = {t0:g}, got {times[0]:g}")
+        raise ValueError(
+            f"times must be after t0 = {format_number(t0)}, got {format_number(times[0])}"
+        )
+    warn_of_clock(t0, times, "times")
     states = np.empty((times.size, *x.shape))
     for k, t in enumerate(times.tolist()):
         x = step(x, t0, t - t0)

@@ -14,6 +14,7 @@ from typing import Annotated
 
 import numpy as np
 
+from ..periods import PeriodsArgument
 from ..validation import (
     Array,
     Bounds,
@@ -179,6 +180,7 @@ def integrate(
     step: float,
     names: tuple[str, ...],
     units: tuple[str, ...],
+    periods: PeriodsArgument = (),
 ) -> Model:
     """Build a model from a rate by :func:`rk4`, with white noise of spectral density (d, d)."""
     return Model(
@@ -187,6 +189,7 @@ def integrate(
         partial(_white_noise, density),
         names=names,
         units=units,
+        periods=periods,
     )
 
 

@@ -20,6 +20,7 @@ from ..validation import (
     PositiveFloat,
     validated,
 )
+from ..periods import PeriodsArgument
 from .base import Model
 from .motion import integrate
 
@@ -137,6 +138,7 @@ def pendulum_angle(
     gravity: NonNegativeFloat = 9.8,
     sigma: tuple[NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0),
     step: PositiveFloat = 0.01,
+    periods: PeriodsArgument = (),
 ) -> Model:
     r"""The pendulum in its chart: the angle θ from the vertical, not wrapped, and its rate.
 
@@ -148,6 +150,9 @@ def pendulum_angle(
         As for :func:`pendulum`.
     sigma : (float, float)
         Strength of white noise on the angle, in rad/√s, and on the rate, in rad/s/√s.
+    periods : sequence of (float or None), or mapping, optional
+        As of :class:`Model`: ``{"theta": 2 * np.pi}`` where turns are not counted. Without it θ
+        runs on.
 
     Examples
     --------
@@ -160,6 +165,7 @@ def pendulum_angle(
         step=step,
         names=("theta", "omega"),
         units=("rad", "rad/s"),
+        periods=periods,
     )
 
 

@@ -130,7 +130,15 @@ def order_nodes(nodes: Sequence[Any], names: Sequence[Any]) -> Sequence[Any]:
 def _are_integers(nodes: Sequence[Any]) -> bool:
     """Whether labels are integers, or tuples of as many integers each."""
     tuples = [node if isinstance(node, tuple) else (node,) for node in nodes]
-    if len({(type(node) is tuple, len(t)) for node, t in zip(nodes, tuples, strict=True)}) > 1:
+    if (
+        len(
+            {
+                (type(node) is tuple, len(t))
+                for node, t in zip(nodes, tuples, strict=True)
+            }
+        )
+        > 1
+    ):
         return False
     return all(isinstance(label, Integral) for entries in tuples for label in entries)
 

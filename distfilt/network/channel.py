@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 
+from ..periods import Periods
 from ..validation import (
     Array,
     ArrayInput,
@@ -98,6 +99,8 @@ class Channel:
         self.runs = runs
         self.faults = _PERFECT if faults is None else faults
         self.t = t
+        # The periods of the beliefs' components, for rules of fusion: a filter sets them.
+        self.periods: Periods = ()
         self._ledger = Ledger.empty(self.graph.n_agents) if ledger is None else ledger
         # Losses are drawn for `_n_drawn` runs, of which this channel's are `_drawn`.
         self._n_drawn = int(np.prod(runs, dtype=np.int64))
@@ -205,9 +208,10 @@ class Channel:
         _check_same_links(weights, self.graph)
         if self._perfect:
             return self._mix_without_faults(values, weights, rounds)
-        for values, _ in self._mix_rounds(values, weights, on_loss, rounds):
-            pass
-        return np.asarray(values)
+        after_rounds = self._mix_rounds(values, weights, on_loss, rounds)
+        # The values after the last round
+        mixed, _ = deque(after_rounds, maxlen=1).pop()
+        return mixed
 
     @validated
     def send_on_links(
@@ -289,16 +293,16 @@ class Channel:
                 count, used, numbers, 8 * numbers, acknowledged=both_ways
             )
             rounds -= count
-            for flat, self_weights in self._mix_block(flat, weights, arrived, on_loss):
-                mixed = flat.reshape(values.shape)
-                yield mixed, self_weights.reshape(*self.runs, self.graph.n_agents)
+            for mixed, self_weights in self._mix_block(flat, weights, arrived, on_loss):
+                flat = mixed
+                by_run = self_weights.reshape(*self.runs, self.graph.n_agents)
+                yield mixed.reshape(values.shape), by_run
 
     def _mix_block(
         self, flat: Array, weights: ConsensusWeights, arrived: Mask, on_loss: LossRule
     ) -> Iterator[tuple[Array, Array]]:
         """Mix values (R A, k) in rounds of which messages have arrived, (rounds, R, E)."""
         graph = self.graph
-        received = flat
         offset = 0
         if self.faults.total_delay:
             # Which messages of earlier rounds arrive now; their values follow below.
@@ -306,7 +310,7 @@ class Channel:
             arrived = self._delay_arrivals(flat.shape, arrived)
         n_rounds, n_runs, n_links = arrived.shape
         self_weights, link_weights = _weights_after_loss(
-            graph, weights, arrived.reshape(-1, n_links), on_loss
+            graph, weights, arrived.reshape(n_rounds * n_runs, n_links), on_loss
         )
         matrix = stack_weights(
             graph, self_weights[:n_runs], link_weights[:n_runs], received_offset=offset
@@ -321,8 +325,7 @@ class Channel:
             if offset:
                 # Own values are present, received ones late: they stand below in one
                 # product.
-                received = self._delay_values(flat)
-                factors = np.concatenate([flat, received])
+                factors = np.concatenate([flat, self._delay_values(flat)])
             flat = matrix @ factors
             yield flat, by_round[k]
 
@@ -355,9 +358,7 @@ class Channel:
         """Send so many floats over some links, all by default; which arrive, (R, E)."""
         if links is None:
             links = np.ones(self.graph.senders.size, dtype=bool)
-        return self._transmit(
-            links, numbers, 8 * numbers, acknowledged=acknowledged
-        )
+        return self._transmit(links, numbers, 8 * numbers, acknowledged=acknowledged)
 
     def _transmit(
         self,
@@ -374,9 +375,10 @@ class Channel:
                 f"got one of {self.faults.total_delay} rounds"
             )
         if not self._perfect:
-            return self._transmit_rounds(
+            arrived = self._transmit_rounds(
                 1, used, scalars, bytes_, acknowledged=acknowledged
-            )[0]
+            )
+            return np.asarray(arrived[0])
         everywhere = np.broadcast_to(used, (self._n_drawn, used.size))
         messages = self._count_by_agent(self.graph.senders[used])
         ledger = self._charge(self.ledger, messages, scalars, bytes_)

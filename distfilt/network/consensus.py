@@ -55,9 +55,7 @@ class Disconnected(RuntimeWarning):
     """
 
 
-def _warn_if_disconnected(
-    channel: Channel, rounds: int | None = None, *, stacklevel: int = 4
-) -> None:
+def _warn_if_disconnected(channel: Channel, rounds: int | None = None) -> None:
     """Warn if messages cannot lead from every agent to every other, however many rounds.
 
     One round says nothing, as a graph that changes may be connected over time. Agents that
@@ -76,7 +74,7 @@ def _warn_if_disconnected(
             f"got {count} components{because}, each of which reaches its own",
             Disconnected,
             # Over the rule and its validation to the rule's caller.
-            stacklevel=stacklevel,
+            stacklevel=4,
         )
 
 

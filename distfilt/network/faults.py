@@ -184,7 +184,8 @@ class Faults(FrozenModel):
         self, graph: Graph, round_: int, runs: int, t: float | None = None
     ) -> Mask:
         """Return which links lose the message of round `round_` in each run, (runs, E)."""
-        return self.draw_rounds(graph, range(round_, round_ + 1), runs, t)[0]
+        lost = self.draw_rounds(graph, range(round_, round_ + 1), runs, t)
+        return np.asarray(lost[0])
 
     def draw_rounds(
         self, graph: Graph, rounds: range, runs: int, t: float | None = None

@@ -15,6 +15,7 @@ from ..ensembles import mean, sample_covariance
 from ..gaussians import intersection_weights
 from ..gaussians.single import match_moments
 from ..linalg import cholesky, solve_lower, symmetrise
+from ..periods import Periods, wrap_differences
 from ..validation import (
     Array,
     ArrayInput,
@@ -29,7 +30,7 @@ from ..validation import (
 from .channel import Channel, fusion_rule
 from .consensus import _warn_if_disconnected
 from .graphs import Graph
-from .weights import _laplacian_weights, _warn_if_unstable
+from .weights import ConsensusWeights, _laplacian_weights, _warn_if_unstable
 
 __all__ = [
     "arithmetic_average",
@@ -40,10 +41,32 @@ __all__ = [
     "mean_pull",
 ]
 
+
+
+def _find_uncertain(covs: Array) -> Mask:
+    """Return which components have a variance, (d,); the others are constants known to all."""
+    variances = np.diagonal(covs, axis1=-2, axis2=-1).reshape(-1, covs.shape[-1])
+    is_uncertain: Mask = (variances != 0).any(axis=0)
+    # A component with a covariance but no variance is left to the check of definiteness.
+    is_correlated = (covs != 0).reshape(-1, *covs.shape[-2:]).any(axis=(0, 1))
+    return is_uncertain | is_correlated
+
+
+def _check_definite_or_known(value: Array, name: str) -> None:
+    """Refuse covariances that are not positive definite in the components that are not known."""
+    is_uncertain = _find_uncertain(value)
+    if not is_uncertain.all():
+        value = value[..., is_uncertain, :][..., is_uncertain]
+    if value.size:
+        check_positive_definite(value, name)
+
+
 Gaussians = tuple[
     Annotated[ArrayInput, "*channel.runs channel.graph.n_agents d"],
     Annotated[
-        ArrayInput, "*channel.runs channel.graph.n_agents d d", check_positive_definite
+        ArrayInput,
+        "*channel.runs channel.graph.n_agents d d",
+        _check_definite_or_known,
     ],
 ]
 Ensembles = Annotated[ArrayInput, "*channel.runs channel.graph.n_agents N d"]
@@ -77,7 +100,8 @@ def covariance_intersection(
     ----------
     belief : tuple (means, covs)
         Each agent's mean, (*runs, A, d), and covariance, (*runs, A, d, d), positive
-        definite.
+        definite. A component that has no variance at any agent is a constant known to
+        all: it needs equal means, and is not sent.
     channel : Channel
         Mean and covariance are sent on each link, d + d(d+1)/2 scalars. A lost message
         is left out.
@@ -100,8 +124,18 @@ def covariance_intersection(
     >>> two[0].ravel().round(6), two[1].ravel().round(6)
     (array([0.6, 0.6]), array([1.2, 1.2]))
     """
+    _warn_if_disconnected(channel, rounds)
+    return _intersect(belief, channel, rule, rounds, channel.periods)
+
+
+def _intersect(
+    belief: Pair, channel: Channel, rule: Rule, rounds: int, periods: Periods
+) -> Pair:
+    """Fuse Gaussians with these periods by covariance intersection, without checks."""
 
     def fuse(received: _Received) -> Pair:
+        if len(periods) == received.means.shape[-1]:
+            received.periods = periods
         self_weights, link_weights = _intersection_weights(received, rule)
         return _sum_information(received, self_weights, link_weights)
 
@@ -127,6 +161,7 @@ def naive_fusion(
     >>> two[1].ravel().round(6)
     array([0.666667, 0.666667])
     """
+    _warn_if_disconnected(channel, rounds)
 
     def fuse(received: _Received) -> Pair:
         # All weights are one: the product of the densities.
@@ -159,6 +194,7 @@ def arithmetic_average(
     >>> two[0].ravel(), two[1].ravel()
     (array([1.5, 1.5]), array([3.75, 3.75]))
     """
+    _warn_if_disconnected(channel, rounds)
 
     def fuse(received: _Received) -> Pair:
         graph = received.graph
@@ -224,6 +260,10 @@ def consensus_pull(
     _warn_if_disconnected(channel, rounds)
     means, covs = belief
     weights = _laplacian_weights(channel.graph, gain)
+    if channel.periods:
+        for _ in range(rounds):
+            means, _ = _mix_circular(means, channel, weights)
+        return means, covs.copy()
     # m <- (I - γ L) m; the weight of a lost mean stays with the own one.
     means = channel.mix(means, weights, on_loss="keep", rounds=rounds)
     return means, covs.copy()
@@ -282,7 +322,10 @@ def mean_pull(
     weights = _laplacian_weights(channel.graph, gain)
     for _ in range(rounds):
         means = pulled.mean(axis=-2)
-        new_means, self_weights = channel._mix_once(means, weights, "keep")
+        if channel.periods:
+            new_means, self_weights = _mix_circular(means, channel, weights)
+        else:
+            new_means, self_weights = channel._mix_once(means, weights, "keep")
         # All members get the same shift of the mean, and their deviations the factor 1
         # - γ |Nbs|.
         factor = (self_weights - gain * include_self)[..., None, None]
@@ -329,16 +372,46 @@ def intersect_ensembles(
     array([[0.5, 2.5],
            [0.5, 2.5]])
     """
+    _warn_if_disconnected(channel, rounds)
     unit = 1.0 if scale is None else scale
     x = ensembles / unit
     means = mean(x)
     covs = sample_covariance(x)
     # Singular if an ensemble has no more members than components.
     check_positive_definite(covs, "ensembles")
-    fused = covariance_intersection((means, covs), channel, rule=rule, rounds=rounds)
+    periods = _scale_periods(channel.periods, scale)
+    fused = _intersect((means, covs), channel, rule, rounds, periods)
     # The affine map from the sample moments to the fused ones, in the given units
     # again.
     return match_moments(x, *fused) * unit
+
+
+def _scale_periods(periods: Periods, scale: Array | None) -> Periods:
+    """Return periods of components that are divided by a scale."""
+    if scale is None:
+        return periods
+    pairs = zip(periods, scale.tolist(), strict=True) if periods else ()
+    return tuple([None if p is None else p / s for p, s in pairs])
+
+
+def _mix_circular(
+    means: Array, channel: Channel, weights: ConsensusWeights
+) -> tuple[Array, Array]:
+    """Mix means (*runs, A, d) by their differences, which wrap, and return the self-weights too.
+
+    m_i + Σ_j w_ij (m_j - m_i); the weight of a lost mean stays with the own one.
+    """
+    graph = channel.graph
+    d = means.shape[-1]
+    flat = means.reshape(-1, graph.n_agents, d)
+    arrived = channel._transmit_numbers(d)
+    difference = flat[:, graph.senders] - flat[:, graph.receivers]
+    difference = wrap_differences(difference, channel.periods)
+    link_weights = weights.link_weights * arrived
+    shift = graph._sum_by_receiver(link_weights[..., None] * difference, 1)
+    self_weights = 1.0 - graph._sum_by_receiver(link_weights, 1)
+    runs = means.shape[:-2]
+    return (flat + shift).reshape(means.shape), self_weights.reshape(*runs, -1)
 
 
 @dataclass(eq=False)
@@ -349,6 +422,7 @@ class _Received:
     means: Array
     covs: Array
     arrived: Mask
+    periods: Periods = ()
 
     def sum_matrices(
         self, self_weights: Array, link_weights: Array, matrices: Array
@@ -359,16 +433,66 @@ class _Received:
         return own_part + self.graph._sum_by_receiver(sent, 1)
 
     def mean_differences(self) -> Array:
-        """Return the received mean minus the receiver's, for each link, (R, E, d)."""
-        return self.means[:, self.graph.senders] - self.means[:, self.graph.receivers]
+        """Return the received mean minus the receiver's, for each link, (R, E, d).
+
+        Angles differ by the shorter way round.
+        """
+        senders = self.means[:, self.graph.senders]
+        difference = senders - self.means[:, self.graph.receivers]
+        return wrap_differences(difference, self.periods)
 
 
 def _repeat(
     belief: Pair, channel: Channel, rounds: int, fuse: Callable[[_Received], Pair]
 ) -> Pair:
     """Exchange means and upper triangles of covariances and fuse them, some times."""
-    # Over the rule that calls this function, and the rule's validation.
-    _warn_if_disconnected(channel, rounds, stacklevel=5)
+    means, covs = belief
+    is_uncertain = _find_uncertain(covs)
+    if not is_uncertain.all():
+        return _repeat_uncertain(belief, channel, rounds, fuse, is_uncertain)
+    return _repeat_all(belief, channel, rounds, fuse, channel.periods)
+
+
+def _repeat_uncertain(
+    belief: Pair,
+    channel: Channel,
+    rounds: int,
+    fuse: Callable[[_Received], Pair],
+    is_uncertain: Mask,
+) -> Pair:
+    """Fuse the components that have a variance; the others are constants known to all."""
+    means, covs = belief
+    known = means[..., ~is_uncertain]
+    if (known != known[..., :1, :]).any():
+        raise ValueError(
+            "belief must have equal means where no agent has a variance, got means that differ by "
+            f"up to {np.ptp(known, axis=-2).max():g}"
+        )
+    new_means = means.copy()
+    new_covs = covs.copy()
+    if is_uncertain.any():
+        block = np.ix_(is_uncertain, is_uncertain)
+        periods = _select_periods(channel.periods, is_uncertain)
+        part = (means[..., is_uncertain], covs[(..., *block)])
+        part = _repeat_all(part, channel, rounds, fuse, periods)
+        new_means[..., is_uncertain], new_covs[(..., *block)] = part
+    return new_means, new_covs
+
+
+def _select_periods(periods: Periods, is_uncertain: Mask) -> Periods:
+    """Return the periods of some components."""
+    chosen = zip(periods, is_uncertain.tolist(), strict=True) if periods else ()
+    return tuple([period for period, is_chosen in chosen if is_chosen])
+
+
+def _repeat_all(
+    belief: Pair,
+    channel: Channel,
+    rounds: int,
+    fuse: Callable[[_Received], Pair],
+    periods: Periods,
+) -> Pair:
+    """Exchange and fuse Gaussians all of whose components have a variance, some times."""
     means, covs = belief
     graph = channel.graph
     d = means.shape[-1]
@@ -378,7 +502,7 @@ def _repeat(
     flat_covs = covs.reshape(-1, graph.n_agents, d, d)
     for _ in range(rounds):
         arrived = channel._transmit_numbers(numbers)
-        received = _Received(graph, flat_means, flat_covs, arrived)
+        received = _Received(graph, flat_means, flat_covs, arrived, periods)
         flat_means, flat_covs = fuse(received)
     return flat_means.reshape(means.shape), flat_covs.reshape(covs.shape)
 

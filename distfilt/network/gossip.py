@@ -56,12 +56,15 @@ def gossip_consensus(
     >>> channel.ledger.messages.sum()
     np.int64(400)
 
-    A round in which an agent without neighbours is drawn changes nothing:
+    A round in which an agent without neighbours is drawn changes nothing, and a
+    :class:`Disconnected` warning says that there is no common average:
 
+    >>> import warnings
     >>> channel = Channel(graphs.Graph.from_edges(3, [(1, 2)]))
-    >>> gossip_consensus(
-    ...     [[0.0], [2.0], [4.0]], channel, rounds=9, rng=np.random.default_rng(1)
-    ... ).ravel()
+    >>> with warnings.catch_warnings(action="ignore"):
+    ...     gossip_consensus(
+    ...         [[0.0], [2.0], [4.0]], channel, rounds=9, rng=np.random.default_rng(1)
+    ...     ).ravel()
     array([0., 3., 3.])
     >>> channel.ledger.messages
     array([0, 6, 6])

@@ -124,9 +124,7 @@ def stack_weights(
     return scipy.sparse.csr_array((data.ravel(), columns.ravel(), pointers), shape)
 
 
-def interleave_weights(
-    graph: Graph, self_weights: Array, link_weights: Array
-) -> Array:
+def interleave_weights(graph: Graph, self_weights: Array, link_weights: Array) -> Array:
     """Return the entries of a matrix of weights in their order, (R, A + E).
 
     Every row: the diagonal entry, then those of the links, ascending by sender. Sums are
@@ -440,7 +438,10 @@ def _warn_if_not_converging(weights: ConsensusWeights, rounds: int) -> None:
     if _converges_plainly(weights):
         return
     is_small = graph.n_agents <= _DENSE
-    factor = weights.convergence_factor if is_small else _growth(weights)
+    if is_small:
+        factor = weights.convergence_factor
+    else:
+        factor = 1.0 if _is_periodic(weights) else _growth(weights)
     # A single round may leave differences as they are, where weights change in time. Those of
     # parts without a link remain, which a warning of its own says.
     diverges = factor > 1 + 1e-9
@@ -455,6 +456,19 @@ def _warn_if_not_converging(weights: ConsensusWeights, rounds: int) -> None:
         )
 
 
+def _is_periodic(weights: ConsensusWeights) -> bool:
+    """Whether nonnegative weights leave agents apart in every second round.
+
+    As where neighbours swap their values, or where links of a bridge have no weight.
+    """
+    if (weights.self_weights < 0).any() or (weights.link_weights < 0).any():
+        return False
+    twice = weights.matrix @ weights.matrix
+    twice.eliminate_zeros()
+    count, _ = scipy.sparse.csgraph.connected_components(twice, connection="strong")
+    return int(count) > 1
+
+
 def _growth(weights: ConsensusWeights) -> float:
     """Return the factor by which the differences of many agents grow in a round, in the end."""
     # A random start has a part of every mode; a fixed seed makes the result repeatable.
@@ -467,7 +481,7 @@ def _growth(weights: ConsensusWeights) -> float:
         sizes.append(float(np.linalg.norm(x)))
         # Scaled, as it may have become very large or very small.
         x = x / max(sizes[-1], 1e-300)
-    return sizes[-1] ** (1 / _POWER_ROUNDS)
+    return float(sizes[-1] ** (1 / _POWER_ROUNDS))
 
 
 def _check_sums_to_one(

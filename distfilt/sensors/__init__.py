@@ -13,8 +13,10 @@ from .kinds import (
     range_bearing,
     stack,
 )
+from .likelihood import LikelihoodSensor
 
 __all__ = [
+    "LikelihoodSensor",
     "Sensor",
     "angles_only",
     "bearing",

@@ -4,7 +4,9 @@ An observation is missing where it is NaN: the component was not measured, or th
 cannot see it from that state (the bearing of a place at which the sensor itself
 stands). A residual with such a component is NaN too, and a filter leaves it out of that
 run's update: a component is used only if the observation has it and so has every
-prediction that it is compared with.
+prediction that it is compared with. The filter's record counts the observations that
+are left out as ``unseen``, and a warning says so once. Only particles and mixtures can
+learn from it: a particle, or a component, that cannot see contradicts what was seen.
 """
 
 from __future__ import annotations
@@ -12,12 +14,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Annotated
+from typing import Annotated, cast
 
 import numpy as np
 
 from ..derivatives import difference_with_error, evaluate_derivative
 from ..linalg import broadcast_leading, factor
+from ..periods import Periods, PeriodsArgument, align, read_periods, wrap_differences
 from ..validation import (
     ALLOW_NAN,
     Array,
@@ -29,6 +32,7 @@ from ..validation import (
     Rng,
     call_user,
     check_array,
+    check_signature,
     validated,
 )
 from ..validation.batching import call_batched
@@ -89,9 +93,13 @@ class Sensor(FrozenModel):
     residual_function : callable, optional
         ``residual_function(observed, predicted)``, for observations that wrap;
         subtraction by default. A function that decreases as the observation increases
-        is refused.
+        is refused. Angles need none if they have `periods`.
+    periods : sequence of (float or None), or mapping, optional
+        The period of each component of the observation that is circular, such as 2π for a
+        compass in rad, and None for the others; or a mapping of components to periods.
     uses_previous : bool
-        Whether the sensor measures a change since the previous observation time.
+        Whether the sensor measures a change since its own last observation. One that is
+        missing (NaN) is none: the next one has the change since the last that came.
     kind : str
         A name, for tables and messages.
     linear : callable, optional
@@ -106,6 +114,12 @@ class Sensor(FrozenModel):
     >>> total = Sensor(1, lambda x: x.sum(axis=-1, keepdims=True), [[0.04]])
     >>> total.predict([1.0, 2.0])
     array([3.])
+
+    A compass, which reads the third component, the heading:
+
+    >>> compass = Sensor(1, lambda x: x[..., 2:3], [[0.01]], periods=(2 * np.pi,))
+    >>> compass.residual([3.0], [-3.0]).round(4)
+    array([-0.2832])
     """
 
     dim: PositiveInt
@@ -118,11 +132,20 @@ class Sensor(FrozenModel):
     kind: str = field(default="sensor", kw_only=True)
     linear: Callable[[int], Array] | None = field(default=None, kw_only=True)
     derivative: Callable[..., Array] | None = field(default=None, kw_only=True)
+    periods: PeriodsArgument = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        periods = read_periods(self.periods, self.dim)
+        object.__setattr__(self, "periods", periods)
+        self._check_signatures()
         if self.residual_function is None:
             return
+        if periods:
+            raise ValueError(
+                "residual_function must be None for a sensor with periods, which wrap its "
+                "differences"
+            )
         # The residual of 1 + 1e-6 and 1 is 1e-6, and -1e-6 if the arguments were
         # exchanged.
         one = np.ones(self.dim)
@@ -132,10 +155,43 @@ class Sensor(FrozenModel):
                 "residual_function must return observed minus predicted, got the opposite sign"
             )
 
+    def _check_signatures(self) -> None:
+        """Refuse functions that cannot be called as the class calls them."""
+        states = "x, previous" if self.uses_previous else "x"
+        check_signature(self.h, "h", states)
+        if self.derivative is not None:
+            check_signature(self.derivative, "derivative", states)
+        if self.linear is not None:
+            check_signature(self.linear, "linear", "d")
+        if self.residual_function is not None:
+            name = "residual_function"
+            check_signature(self.residual_function, name, "observed, predicted")
+
     @cached_property
     def noise_sqrt(self) -> Array:
         """A factor of R, (m, m)."""
         return factor(self.noise_cov)
+
+    @property
+    def wraps(self) -> bool:
+        """Whether differences of observations wrap: by `periods` or a function of one's own."""
+        return bool(self.periods) or self.residual_function is not None
+
+    def bring_near(self, values: Array, reference: Array) -> Array:
+        """Return values (..., m) on the branch of a reference, unchecked.
+
+        Values that are NaN, or that have no reference, stay as they are.
+
+        >>> compass = Sensor(1, lambda x: x, [[1.0]], periods=(2 * np.pi,))
+        >>> compass.bring_near(np.array([3.0]), np.array([-3.0])).round(4)
+        array([-3.2832])
+        """
+        if self.residual_function is None:
+            return align(values, reference, cast(Periods, self.periods))
+        # r - residual(r, v) is v on the branch of r, if the residual wraps.
+        reference = np.broadcast_to(reference, values.shape)
+        aligned = reference - self.residual(reference, values)
+        return np.where(np.isnan(aligned), values, aligned)
 
     @validated
     def predict(
@@ -200,7 +256,10 @@ class Sensor(FrozenModel):
         (array([2.]), array([3.]))
         """
         if self.residual_function is None:
-            return np.asarray(observed - predicted)
+            difference = np.asarray(observed - predicted)
+            if not self.periods:
+                return difference
+            return wrap_differences(difference, cast(Periods, self.periods))
         shape = broadcast_leading(observed.shape, predicted.shape, "predicted")
         # Copies, since the user's function may work in place.
         residual = np.asarray(
@@ -225,7 +284,9 @@ class Sensor(FrozenModel):
         # Hᵀ.
         if is_first_use(self, "linear"):
             predicted = self.predict(np.eye(dim))
-            if not np.allclose(predicted, matrix.T, atol=1e-9):
+            # Predictions that wrap may be on another branch.
+            difference = self.residual(predicted, matrix.T)
+            if not np.allclose(difference, 0.0, atol=1e-9 + 1e-5 * np.abs(matrix).max()):
                 raise ValueError(
                     "linear must return the matrix of h, got one that does not match it"
                 )

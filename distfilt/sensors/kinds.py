@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from scipy.linalg import block_diag
 
+from ..periods import Periods, PeriodsArgument, read_periods
 from ..validation import (
     Array,
     ArrayInput,
@@ -20,6 +21,7 @@ from ..validation import (
 )
 from ..validation.checks import check_distinct
 from .base import Sensor, wrap
+from .likelihood import LikelihoodSensor
 
 __all__ = [
     "angles_only",
@@ -51,13 +53,20 @@ Point = Annotated[ArrayInput, "2"]
 
 
 @validated
-def component(indices: DistinctIndices, *, std: Deviation) -> Sensor:
+def component(
+    indices: DistinctIndices, *, std: Deviation, periods: PeriodsArgument = ()
+) -> Sensor:
     """Measure components of the state, ``h(x) = x[indices]``, with standard deviation `std` each.
+
+    `periods` are those of the observation, as of :class:`Sensor`: a compass has one.
 
     Examples
     --------
     >>> component([0, 2], std=0.1).predict([1.0, 2.0, 3.0])
     array([1., 3.])
+    >>> compass = component([2], std=0.1, periods=(2 * np.pi,))
+    >>> compass.residual([3.0], [-3.0]).round(4)
+    array([-0.2832])
     """
     return Sensor.construct(
         len(indices),
@@ -65,12 +74,17 @@ def component(indices: DistinctIndices, *, std: Deviation) -> Sensor:
         _diagonal_cov([std] * len(indices)),
         kind="component",
         linear=partial(_selection_matrix, indices=indices),
+        periods=read_periods(periods, len(indices)),
     )
 
 
 @validated
-def increment(indices: DistinctIndices, *, std: Deviation) -> Sensor:
+def increment(
+    indices: DistinctIndices, *, std: Deviation, periods: PeriodsArgument = ()
+) -> Sensor:
     """Measure the change of components since the previous observation time, to `std` each.
+
+    The increment of an angle has its period: `periods`, as of :class:`Sensor`.
 
     Examples
     --------
@@ -85,6 +99,7 @@ def increment(indices: DistinctIndices, *, std: Deviation) -> Sensor:
         kind="increment",
         # Not `linear`: H belongs to sensors of the present state alone.
         derivative=partial(_increment_jacobian, indices=indices),
+        periods=read_periods(periods, len(indices)),
     )
 
 
@@ -261,7 +276,7 @@ def _angle_sensor(
         _diagonal_cov([std]),
         kind=kind,
         derivative=partial(_angle_jacobian, **geometry),
-        residual_function=partial(_wrap_residual, period=period),
+        periods=(period,),
     )
 
 
@@ -306,7 +321,7 @@ def range_bearing(
         partial(_range_bearing, heading=heading, **geometry),
         _diagonal_cov(std),
         # Of (distance, bearing) only the second wraps.
-        residual_function=partial(_wrap_residual, k=1),
+        periods=(None, 2 * np.pi),
         kind="range_bearing",
         derivative=partial(_range_bearing_jacobian, **geometry),
     )
@@ -389,15 +404,6 @@ def _range_bearing_jacobian(x: Array, indices: Sequence[int], origin: Array) -> 
     return np.concatenate(rows, axis=-2)
 
 
-def _wrap_residual(
-    observed: Array, predicted: Array, k: int = 0, period: float = 2 * np.pi
-) -> Array:
-    """Return differences of which component k is wrapped."""
-    residual = np.asarray(observed - predicted)
-    residual[..., k] = wrap(residual[..., k], period=period)
-    return residual
-
-
 # The direction to a body in space.
 
 
@@ -437,7 +443,8 @@ def angles_only(
         2,
         partial(_angles_only, form=form, observer=observer, hidden=hidden),
         _diagonal_cov([std, std]),
-        residual_function=_wrap_residual,
+        # The first angle is a direction in the plane; a declination, or an arcsine, is none.
+        periods=(2 * np.pi, None),
         kind="angles_only",
     )
 
@@ -526,14 +533,23 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
     """
     if not sensors:
         raise ValueError("sensors must have at least one Sensor, got none")
+    if any(isinstance(sensor, LikelihoodSensor) for sensor in sensors):
+        raise ValueError(
+            "sensors must have Gaussian noise to be stacked, got a LikelihoodSensor: give an agent "
+            "a list of its sensors"
+        )
     # Independent noise: R is block diagonal.
     cov = block_diag(*[sensor.noise_cov for sensor in sensors])
     cov.setflags(write=False)
     # Residuals are split only if some part wraps; plain subtraction does for the
     # others.
     residual_function = None
+    periods: Periods = ()
     if any(sensor.residual_function is not None for sensor in sensors):
         residual_function = partial(_stack_residuals, sensors=sensors)
+    elif any(sensor.periods for sensor in sensors):
+        for sensor in sensors:
+            periods += tuple(sensor.periods) or (None,) * sensor.dim
     # A stack of matrices, if every part has one; otherwise Jacobians are stacked.
     linear = None
     if all(sensor.linear is not None for sensor in sensors):
@@ -544,6 +560,7 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
         cov,
         kind="stack",
         residual_function=residual_function,
+        periods=periods,
         uses_previous=any(sensor.uses_previous for sensor in sensors),
         linear=linear,
         derivative=partial(_stack_jacobians, sensors=sensors),

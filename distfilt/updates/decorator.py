@@ -134,7 +134,9 @@ def has_tag(update: Update, tag: str) -> bool:
 
     One that stacks updates ensembles with a noise covariance each in one call, as every update of
     this package does; a plain function gets one agent's ensemble at a time. One that repredicts
-    takes a function ``predict``. One that accepts missing components gets them as NaN.
+    takes a function ``predict``. One that accepts missing components gets them as NaN. One that
+    weights members by their likelihoods (``weights_members``) compares each with the observation
+    by itself, so that predicted angles are brought near the observation one by one.
 
     >>> has_tag(print, "stacks")
     False
@@ -155,6 +157,7 @@ def wraps_update(wrapped: Update) -> Callable[[F], F]:
         checked: Any = update(wrapper)
         checked.stacks = has_tag(wrapped, "stacks")
         checked.accepts_missing = has_tag(wrapped, "accepts_missing")
+        checked.weights_members = has_tag(wrapped, "weights_members")
         return cast(F, checked)
 
     return decorate

@@ -19,6 +19,7 @@ import numpy as np
 from ..ensembles import Ensemble, exact_noise
 from ..linalg import center_ensemble, cholesky, solve_definite
 from ..models import Model
+from ..periods import step_members
 from ..validation import Array, NonNegativeFloat, Rng, validated
 from .decorator import perturb_observations, update
 
@@ -287,7 +288,7 @@ def stochastic_forecast(
     ... ).ravel()
     array([1., 2.])
     """
-    forecast = model.step(ensemble, t, dt)
+    forecast = step_members(model, ensemble, t, dt)
     root = model.noise_sqrt(t, dt)
     # Without noise nothing is drawn.
     if not np.count_nonzero(root):
@@ -320,7 +321,7 @@ def exact_forecast(
     >>> bool(abs(forecast.mean()) < 1e-12), float(forecast.var(ddof=1).round(12))
     (True, 1.0)
     """
-    forecast = model.step(ensemble, t, dt)
+    forecast = step_members(model, ensemble, t, dt)
     root = model.noise_sqrt(t, dt)
     # Without noise nothing is drawn.
     if not root.any():

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..coupling.transform import normalize_weights
-from ..linalg import cholesky, factor, log_sum_exp, solve_lower
+from ..linalg import cholesky, factor, log_det, log_sum_exp, solve_lower
 from ..validation import (
     Array,
     ArrayInput,
@@ -241,7 +241,8 @@ def reweight(
     Raises an error if all likelihoods are zero.
     """
     # log w_i + log p(y | x_i), and the logarithm of their sum.
-    joint = log_weights + log_likelihood(predicted, observed, noise)
+    seen = log_likelihood(predicted, observed, noise, contradict=True)
+    joint = log_weights + seen
     total = log_sum_exp(joint)
     if not all_finite(total):
         raise ArithmeticError("every particle has a likelihood of zero")
@@ -249,13 +250,29 @@ def reweight(
     return np.asarray(np.maximum(joint - total, -1e300))
 
 
-def log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
-    """Return the log-likelihood of each particle's prediction (..., N, m), up to a constant."""
+def log_likelihood(
+    predicted: Array, observed: Array, noise: Array, *, contradict: bool = False
+) -> Array:
+    """Return the log-likelihood of each particle's prediction (..., N, m), up to a constant.
+
+    A component that some particle cannot predict is left out. With `contradict` it is left out
+    only if no particle can: otherwise those that cannot have a likelihood of zero.
+
+    >>> predicted = np.array([[1.0], [np.nan]])
+    >>> log_likelihood(predicted, np.array([1.0]), np.eye(1), contradict=True)
+    array([ -0., -inf])
+    """
     # Components first: sums over a few of them then run along all particles.
     residual = np.subtract(observed[..., None], predicted.mT, order="C")
     covariance = noise
+    contradicting: Mask | None = None
     if not all_finite(residual):
-        missing = np.asarray(np.isnan(residual).any(axis=-1))
+        is_unseen = np.isnan(residual)
+        missing = np.asarray(is_unseen.any(axis=-1))
+        if contradict:
+            missing = np.asarray(is_unseen.all(axis=-1))
+            contradicting = (is_unseen & ~missing[..., None]).any(axis=-2)
+            residual = np.where(is_unseen, 0.0, residual)
         # A missing component gets a zero residual and a unit variance of its own in R.
         present = ~missing
         both_present = present[..., :, None] & present[..., None, :]
@@ -264,7 +281,27 @@ def log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
     # -|L⁻¹ r|² / 2 with R = L L': one solve with all particles as right-hand sides.
     whitened = solve_lower(cholesky(covariance), residual)
     whitened = np.ascontiguousarray(whitened)
-    return np.asarray(-0.5 * (whitened * whitened).sum(axis=-2))
+    logs = np.asarray(-0.5 * (whitened * whitened).sum(axis=-2))
+    if contradicting is not None:
+        logs[contradicting] = -np.inf
+    return logs
+
+
+def log_normalizer(observed: Array, noise: Array) -> Array:
+    """Return the constant that :func:`log_likelihood` leaves out, (...), of observations (..., m).
+
+    It counts the components that are not missing.
+
+    >>> log_normalizer(np.array([[0.0, 0.0], [0.0, np.nan]]), np.eye(2)).round(4)
+    array([-1.8379, -0.9189])
+    """
+    present = ~np.isnan(observed)
+    # -(log det R + m log 2π) / 2 of the present components; the others have a unit variance.
+    is_pair = present[..., :, None] & present[..., None, :]
+    covariance = np.where(is_pair, noise, np.eye(noise.shape[-1]))
+    size = present.sum(axis=-1)
+    log_volume = log_det(cholesky(covariance))
+    return np.asarray(-0.5 * (log_volume + size * np.log(2 * np.pi)))
 
 
 def distinct_fraction(points: Array) -> Array:

@@ -240,3 +240,7 @@ def etpf(
     if not rejuvenation:
         return analysis
     return coupling.rejuvenate(analysis, ensemble, bandwidth=rejuvenation, rng=rng)
+
+
+# Filters then bring predicted angles near the observation, each by itself.
+vars(etpf)["weights_members"] = True

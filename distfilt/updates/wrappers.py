@@ -6,14 +6,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 
 from .. import coupling
 from ..coupling.constraints import Constraint, Motion
+from ..linalg import cholesky, solve_lower
+from ..sensors import Sensor
 from ..validation import (
+    ALLOW_NAN,
     Array,
     ArrayInput,
     Bounds,
@@ -22,6 +27,7 @@ from ..validation import (
     PositiveFloat,
     Rng,
     call_user,
+    check_array,
     validated,
 )
 from .decorator import Update, has_tag, with_missing, wraps_update
@@ -48,15 +54,20 @@ def _apply_after(update: Update, change: Callable[[Array], Array]) -> Update:
         *,
         rng: Rng,
         predict: Callable[[Array], Array] | None = None,
+        observation_places: Array | None = None,
     ) -> Array:
-        # Only an update that repredicts takes a function `predict`.
+        # Only an update that repredicts takes a function `predict`, and only one by places them.
         options: dict[str, Any] = {"rng": rng}
         if predict is not None:
             options["predict"] = predict
+        if observation_places is not None:
+            options["observation_places"] = observation_places
         analysis = call_user(update, ensemble, predicted, observed, noise, **options)
         return change(analysis)
 
-    vars(update_and_change)["repredicts"] = has_tag(update, "repredicts")
+    for tag in ("repredicts", "locates"):
+        vars(update_and_change)[tag] = has_tag(update, tag)
+    vars(update_and_change)["locate"] = find_locate(update)
     return update_and_change
 
 
@@ -281,22 +292,31 @@ def serially(update: Update) -> Update:
     return _one_by_one(update, None)
 
 
+Periods = PositiveFloat | Annotated[ArrayInput, "k", ALLOW_NAN]
+"""The length of a ring along every axis, or one for each axis."""
+
+
 @validated
 def with_localization(
     update: Update,
     *,
     places: Annotated[ArrayInput, "d k"],
-    observation_places: Annotated[ArrayInput, "m k"],
+    observation_places: Any,
     radius: PositiveFloat,
-    period: PositiveFloat | None = None,
+    period: Periods | None = None,
 ) -> Update:
     r"""Let each observation change near components only: for few members in a large space.
 
     Observations are assimilated one after the other, as by :func:`serially`. The change that one
     makes in a component at distance r is multiplied by Gaspari and Cohn's function of r over
-    `radius`, which falls from 1 to 0.21 at one radius and to 0 at two. For updates by a gain with
-    independent noise that multiplies the sample covariances by the same numbers: chance
-    correlations of far components are left out.
+    `radius`, which falls from 1 to 0.21 at one radius and to 0 at two. For updates by a gain
+    that multiplies the sample covariances by the same numbers: chance correlations of far
+    components are left out.
+
+    Observations with correlated noise (by more than rounding, 1e-12) are whitened if they are in
+    different places. Each is then
+    a mixture :math:`\sum_jw_jh_j` of the observations that are correlated with it, whose
+    covariance with component k is :math:`\sum_jw_j\rho_{kj}\operatorname{cov}(x_k,h_j)`.
 
     Parameters
     ----------
@@ -306,20 +326,31 @@ def with_localization(
         near components and not of far ones.
     places : array_like, (d, k)
         Coordinates of each component of the state.
-    observation_places : array_like, (m, k)
-        Coordinates of each component of all observations that an agent receives in a step, in the
-        order of the sending agents. So they fit a single agent, or agents that all receive the
-        same observations. Components may be NaN, but no observation may be absent.
+    observation_places : mapping, callable, or array_like, (m, k)
+        Where the observations are. In a filter: a mapping from each sensor to its place, (k,), or
+        to the places of its components, (sensor.dim, k); or a function of the sensor, for sensors
+        that move. Then observations may be missing or lost, and every agent may receive others.
+        An array has the places of all observations that an agent receives in a step, in the order
+        of the sending agents; it fits a single agent, or agents that all receive the same
+        observations, none of which is absent. Components may be NaN.
     radius : float
         In the units of the coordinates.
-    period : float, optional
-        Length of a ring, along each coordinate, on which distances are the shorter way round.
+    period : float or array_like, (k,), optional
+        Length of a ring, along every coordinate or along each, on which distances are the shorter
+        way round. NaN or infinity stands for a coordinate that does not return.
+
+    Returns
+    -------
+    callable
+        An update with two more options: ``predict``, as of :func:`serially`, and
+        ``observation_places``, (m, k) or (..., m, k), which a filter passes.
 
     Notes
     -----
     G. Gaspari, S. E. Cohn, Quarterly Journal of the Royal Meteorological Society 125 (1999)
     723-757, equation (4.10); P. L. Houtekamer, H. L. Mitchell, Monthly Weather Review 129 (2001)
-    123-137.
+    123-137. The change by a mixture is regressed on its own change, as by J. L. Anderson, Monthly
+    Weather Review 131 (2003) 634-642.
 
     Examples
     --------
@@ -352,14 +383,105 @@ def with_localization(
     [-0.049 -0.902]
     [-0.049 -0.902]
     [-0.049 -0.902]
+
+    Agents on a path, each of which receives its neighbours' observations only:
+
+    >>> from distfilt.filters import EnsembleFilter
+    >>> from distfilt.models import Model
+    >>> from distfilt.network import graphs
+    >>> from distfilt.sensors import component
+    >>> still = Model(3, lambda x, t, dt: x, lambda t, dt: np.zeros((3, 3)))
+    >>> sensors = [component([k], std=1.0) for k in range(3)]
+    >>> local = with_localization(
+    ...     enkf,
+    ...     places=[[0.0], [5.0], [10.0]],
+    ...     observation_places={s: [5.0 * k] for k, s in enumerate(sensors)},
+    ...     radius=1.0,
+    ... )
+    >>> f = EnsembleFilter(still, sensors, graphs.path(3), update=local, members=20)
+    >>> state = f.start((np.zeros(3), np.eye(3)), rng=np.random.default_rng(0))
+    >>> after = f.step(state, 0.0, [[3.0], None, [3.0]])
+    >>> (after.ensembles != state.ensembles).any(axis=1)
+    array([[ True, False, False],
+           [ True, False,  True],
+           [False, False,  True]])
     """
-    # Distances of all components (and of predictions, see `serially`) from each observation.
-    points = np.concatenate([places, observation_places])
-    distance = np.abs(points[:, None] - observation_places)
-    if period is not None:
-        distance = np.minimum(distance % period, -distance % period)
-    ratio = np.linalg.norm(distance, axis=-1) / radius
-    return _one_by_one(update, gaspari_cohn(ratio))
+    k = places.shape[1]
+    periods = None if period is None else _check_periods(period, k)
+    fixed: Array | None = None
+    locate: Callable[[Sensor], Array] | None = None
+    if isinstance(observation_places, Mapping) or callable(observation_places):
+        locate = _make_locate(observation_places, k)
+    else:
+        fixed = check_array(observation_places, "observation_places", ("m", k))
+
+    def find_taper(d: int, m: int, given: Array | None) -> Array:
+        """Return the taper of components and predictions, (d + m, m) or (..., d + m, m)."""
+        at = fixed if given is None else given
+        if at is None:
+            raise ValueError(
+                "observation_places must be given with every call of an update whose places "
+                "are those of sensors, got None"
+            )
+        _check_places(len(places), at.shape, d, m)
+        # Places of all components, and of predictions (see `serially`).
+        lead = at.shape[:-2]
+        components = np.broadcast_to(places, (*lead, *places.shape))
+        points = np.concatenate([components, at], axis=-2)
+        distance = np.abs(points[..., :, None, :] - at[..., None, :, :])
+        if periods is not None:
+            distance = np.minimum(distance % periods, -distance % periods)
+        return gaspari_cohn(np.linalg.norm(distance, axis=-1) / radius)
+
+    local: Any = _one_by_one(update, find_taper)
+    local.locates = True
+    local.locate = locate
+    return cast(Update, local)
+
+
+def find_locate(update: Any) -> Callable[[Sensor], Array] | None:
+    """Return the function of an update that gives a sensor's places, (sensor.dim, k), if any.
+
+    >>> find_locate(print)
+    """
+    function = update.func if isinstance(update, partial) else update
+    locate: Callable[[Sensor], Array] | None = getattr(function, "locate", None)
+    return locate
+
+
+def _check_periods(period: Any, k: int) -> Array:
+    """Return a positive period for each of k axes, infinity where a coordinate does not return."""
+    periods = np.broadcast_to(np.asarray(period, dtype=np.float64), (k,)).copy()
+    periods[np.isnan(periods)] = np.inf
+    if not (periods > 0).all():
+        raise ValueError(f"period must be positive, got {periods.tolist()}")
+    return periods
+
+
+def _make_locate(
+    given: Mapping[Sensor, Any] | Callable[[Sensor], Any], k: int
+) -> Callable[[Sensor], Array]:
+    """Return a function that gives the places (sensor.dim, k) of a sensor's components."""
+
+    def locate(sensor: Sensor) -> Array:
+        if isinstance(given, Mapping):
+            if sensor not in given:
+                raise ValueError(
+                    "observation_places must have a place for every sensor, got none for "
+                    f"{sensor}"
+                )
+            value = given[sensor]
+        else:
+            value = call_user(given, sensor)
+        place = np.asarray(check_array(value, "observation_places", (...,)))
+        if place.shape not in ((k,), (sensor.dim, k)):
+            raise ValueError(
+                f"observation_places must have shape ({k},) or ({sensor.dim}, {k}) for a "
+                f"sensor, got {place.shape}"
+            )
+        return np.broadcast_to(place, (sensor.dim, k))
+
+    return locate
 
 
 def gaspari_cohn(ratio: Array) -> Array:
@@ -374,10 +496,17 @@ def gaspari_cohn(ratio: Array) -> Array:
     return np.asarray(np.where(r <= 1, inside, np.where(r < 2, outside, 0.0)))
 
 
-def _one_by_one(update: Update, taper: Array | None) -> Update:
+_ROUNDING = 1e-12
+"""Correlations of a localised update's observations that are rounding."""
+
+Taper = Callable[[int, int, Array | None], Array]
+"""``taper(d, m, observation_places)``: the factors of the changes, (..., d + m, m)."""
+
+
+def _one_by_one(update: Update, find_taper: Taper | None) -> Update:
     """Return an update by groups of correlated observations in turn.
 
-    The changes by each observation are multiplied by its column of `taper`, (d + m, m).
+    The changes by each observation are multiplied by its column of a taper.
     """
 
     @wraps_update(update)
@@ -389,62 +518,197 @@ def _one_by_one(update: Update, taper: Array | None) -> Update:
         *,
         rng: Rng,
         predict: Callable[[Array], Array] | None = None,
+        observation_places: Annotated[ArrayInput, "... m k"] | None = None,
     ) -> Array:
         d = ensemble.shape[-1]
-        if taper is not None:
-            _check_taper(taper, d, predicted.shape[-1])
-        # Predictions that are not made again move along, as components d to d + m of the state.
-        carries_predictions = predict is None
-        for turn, group in enumerate(_group_correlated(noise)):
+        taper: Array | None = None
+        if find_taper is None and observation_places is not None:
+            raise ValueError("observation_places must be None without a localisation")
+        if find_taper is not None:
+            taper = find_taper(d, predicted.shape[-1], observation_places)
+        is_predicted = ~np.isnan(predicted).any(axis=-2)
+        present = np.where(is_predicted, observed, np.nan)
+        turns = _plan_turns(present, noise, taper)
+        for number, turn in enumerate(turns):
             # The first group meets the filter's own predictions.
-            if predict is not None and turn:
+            if predict is not None and number:
                 predicted = call_user(predict, ensemble)
             state = ensemble
-            if carries_predictions:
+            # Predictions that are not made again move along, as components d to d + m.
+            if predict is None:
                 state = np.concatenate([ensemble, predicted], axis=-1)
-            analysis = with_missing(
-                update,
-                state,
-                predicted[..., group],
-                observed[..., group],
-                noise[..., group[:, None], group],
-                rng=rng,
-            )
-            if taper is not None:
-                # x <- x + rho (x' - x); a group's component has its nearest observation's rho.
-                rho = taper[: state.shape[-1], group].max(axis=-1)
-                analysis = state + rho * (analysis - state)
+            analysis = turn.apply(update, state, predicted, taper, rng)
             # The next group starts from here.
             ensemble = analysis[..., :d]
-            if carries_predictions:
+            if predict is None:
                 predicted = analysis[..., d:]
         return ensemble
 
     tagged: Any = update_in_turn
     tagged.repredicts = True
     # Every observation keeps its column of the taper, also where others are missing.
-    tagged.accepts_missing = taper is not None
+    tagged.accepts_missing = find_taper is not None
     return update_in_turn
 
 
-def _check_taper(taper: Array, d: int, m: int) -> None:
-    """Raise an error unless there are coordinates for d components and m observations."""
-    n_observed = taper.shape[1]
-    n_state = len(taper) - n_observed
-    if (n_state, n_observed) != (d, m):
-        raise ValueError(
-            f"places must have {d} rows and observation_places {m}, one for each "
-            f"component and observation, got {n_state} and {n_observed}"
+@dataclass(frozen=True)
+class _Group:
+    """Observations that are assimilated together: correlated ones, or a single one."""
+
+    indices: Indices
+    observed: Array
+    noise: Array
+
+    def apply(
+        self,
+        update: Update,
+        state: Array,
+        predicted: Array,
+        taper: Array | None,
+        rng: Rng,
+    ) -> Array:
+        """Return the state after the observations, its changes multiplied by their taper."""
+        group = self.indices
+        analysis = with_missing(
+            update,
+            state,
+            predicted[..., group],
+            self.observed[..., group],
+            self.noise[..., group[:, None], group],
+            rng=rng,
+        )
+        if taper is None:
+            return np.asarray(analysis)
+        # x <- x + rho (x' - x); all columns of the group are the same.
+        rho = taper[..., None, : state.shape[-1], group[0]]
+        return np.asarray(state + rho * (analysis - state))
+
+
+@dataclass(frozen=True)
+class _Mixture:
+    """One of several correlated observations in different places, after whitening.
+
+    It is sum_j w_j y_j with noise of unit variance.
+    """
+
+    indices: Indices
+    weights: Array
+    """(..., g)"""
+    value: Array
+    """(...,), NaN where the observation is missing."""
+
+    def apply(
+        self,
+        update: Update,
+        state: Array,
+        predicted: Array,
+        taper: Array | None,
+        rng: Rng,
+    ) -> Array:
+        """Return the state after the observation, with the covariances multiplied by the taper."""
+        local = cast(Array, taper)
+        rho = local[..., self.indices]
+        n_state = state.shape[-1]
+        d = rho.shape[-2] - local.shape[-1]
+        weights = self.weights[..., None, :]
+        parts = predicted[..., self.indices]
+        # A missing observation has no weight in any other.
+        parts = np.where(np.broadcast_to(weights != 0, parts.shape), parts, 0.0)
+        is_predicted = np.asarray(np.isfinite(parts).all(axis=(-2, -1)))
+        parts = np.where(is_predicted[..., None, None], parts, 0.0)
+        mixed = (weights * parts).sum(axis=-1, keepdims=True)
+        # Anomalies, and their products summed over the members.
+        x = state - state.mean(axis=-2, keepdims=True)
+        h = parts - parts.mean(axis=-2, keepdims=True)
+        z = mixed - mixed.mean(axis=-2, keepdims=True)
+        # sum_j w_j rho_kj cov(x_k, h_j), and the mixture's tapered variance.
+        local_cov = (rho[..., :n_state, :] * weights * (x.mT @ h)).sum(axis=-1)
+        between = rho[..., d + self.indices, :]
+        products = weights.mT * weights * between * (h.mT @ h)
+        local_variance = np.maximum(products.sum(axis=(-2, -1)), 0.0)
+        variance = (z * z).sum(axis=(-2, -1))
+        is_used = (variance > 0) & (local_variance > 0) & is_predicted
+        target = np.where(is_used, self.value, np.nan)[..., None]
+        # The update meets a prediction with the tapered variance, as a component of the state.
+        ratio = np.ones_like(variance)
+        np.divide(local_variance, variance, out=ratio, where=is_used)
+        z = np.sqrt(ratio)[..., None, None] * z
+        tapered = mixed.mean(axis=-2, keepdims=True) + z
+        extended = np.concatenate([state, tapered], axis=-1)
+        analysis = with_missing(update, extended, tapered, target, np.eye(1), rng=rng)
+        change = analysis - extended
+        # A gain changes member i by c_i cov(x, z), so that c_i follows from the change of z.
+        unit = np.where(is_used, local_variance, 1.0)[..., None, None]
+        c = change[..., n_state:] / unit
+        rest = change[..., :n_state] - c * (x.mT @ z).mT
+        # An update that is not by a gain leaves a rest, which has no parts.
+        squares = weights * weights
+        share = (rho[..., :n_state, :] * squares).sum(axis=-1) / squares.sum(axis=-1)
+        return np.asarray(
+            state + c * local_cov[..., None, :] + share[..., None, :] * rest
         )
 
 
-def _group_correlated(noise: Array) -> list[Indices]:
-    """Return the indices of observations with correlated noise, in the order of their first."""
+def _plan_turns(
+    observed: Array, noise: Array, taper: Array | None
+) -> list[_Group | _Mixture]:
+    """Return what is assimilated in turn: groups in one place, and whitened observations."""
+    turns: list[_Group | _Mixture] = []
+    rounding = 0.0 if taper is None else _ROUNDING
+    for group in _group_correlated(noise, rounding):
+        columns = None if taper is None else taper[..., group]
+        # All observations of a group are in one place, or there are no places.
+        if columns is None or (columns == columns[..., :1]).all():
+            turns.append(_Group(group, observed, noise))
+            continue
+        turns.extend(_whiten(group, observed[..., group], noise))
+    return turns
+
+
+def _whiten(group: Indices, observed: Array, noise: Array) -> list[_Mixture]:
+    """Return mixtures of correlated observations that have independent noise of unit variance."""
+    g = group.size
+    covariance = noise[..., group[:, None], group]
+    missing = np.isnan(observed)
+    if missing.any():
+        # A missing one gets a unit variance of its own.
+        either = missing[..., :, None] | missing[..., None, :]
+        covariance = np.where(either, np.eye(g), covariance)
+    # W = L⁻¹ for R = L L': W R W' = I.
+    whitening = solve_lower(cholesky(covariance), np.eye(g))
+    values = np.where(missing, 0.0, observed)
+    mixed = (whitening @ values[..., None])[..., 0]
+    mixed = np.where(missing, np.nan, mixed)
+    return [
+        _Mixture(group, np.asarray(whitening[..., i, :]), mixed[..., i])
+        for i in range(g)
+    ]
+
+
+def _check_places(n_state: int, shape: tuple[int, ...], d: int, m: int) -> None:
+    """Raise an error unless there are coordinates for d components and m observations."""
+    if (n_state, shape[-2]) != (d, m):
+        raise ValueError(
+            f"places must have {d} rows and observation_places {m}, one for each "
+            f"component and observation, got {n_state} and {shape[-2]}: where observations "
+            "are lost, or agents receive different ones, pass a mapping from each sensor to "
+            "its place"
+        )
+
+
+def _group_correlated(noise: Array, rounding: float = 0.0) -> list[Indices]:
+    """Return the indices of observations with correlated noise, in the order of their first.
+
+    Correlations up to `rounding` do not count.
+    """
     from scipy.sparse import csgraph, csr_array
 
     # Over a batch: observations that are correlated in any of its covariances stay together.
-    correlated = (noise != 0).reshape(-1, *noise.shape[-2:]).any(axis=0)
+    stds = np.sqrt(np.diagonal(noise, axis1=-2, axis2=-1))
+    least = rounding * stds[..., :, None] * stds[..., None, :]
+    correlated = np.abs(noise) > least
+    in_any = correlated.reshape(-1, *noise.shape[-2:]).any(axis=0)
     # Groups are the connected components of the graph of correlations.
-    graph = csr_array(correlated)
+    graph = csr_array(in_any)
     labels = csgraph.connected_components(graph, directed=False)[1]
     return [np.flatnonzero(labels == label) for label in dict.fromkeys(labels.tolist())]

@@ -53,8 +53,9 @@ from .checks import (
     check_positive_definite,
     check_positive_semidefinite,
     check_probabilities,
+    format_number,
 )
-from .decorators import call_user, skip_validation, validated
+from .decorators import call_user, check_signature, skip_validation, validated
 from .first_use import is_first_use
 from .frozen import FrozenModel
 from .optional import import_optional
@@ -90,6 +91,8 @@ __all__ = [
     "check_positive_definite",
     "check_positive_semidefinite",
     "check_probabilities",
+    "check_signature",
+    "format_number",
     "import_optional",
     "is_first_use",
     "skip_validation",

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from .checks import (
     InvalidArgumentError,
     check_array,
+    describe_misshape,
     format_shape,
     match_shape,
     type_name,
@@ -210,9 +211,22 @@ def _convert_array(
         if array.dtype.kind not in dtype_kinds or is_masked:
             raise TypeError
     if shape is not None and not context.bind_shape(array.shape, shape):
-        expected = format_shape(context.resolve(shape.names))
-        raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
+        names = context.resolve(shape.names)
+        raise ValueError(
+            f"{name} must have shape {format_shape(names)}, got {array.shape}"
+            f"{describe_misshape(array.shape, names) or _find_column(array.shape, context)}"
+        )
     return array
+
+
+def _find_column(shape: tuple[int, ...], context: CallContext) -> str:
+    """Return which earlier argument is a column vector that made another shape look wrong."""
+    for name, value in context.arguments.items():
+        column = np.shape(value) if isinstance(value, np.ndarray | list) else ()
+        # A vector of n numbers as (n, 1), beside an array with axes of n.
+        if column[1:] == (1,) and column[0] > 1 and column[0] == shape[-1]:
+            return f": {name} has shape {column}, a column; give {name}[:, 0]"
+    return ""
 
 
 def _convert_sequence(

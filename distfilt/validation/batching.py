@@ -95,6 +95,7 @@ def _compare_with_single_state(
     expected = (*states[0].shape[:-1], owner.dim)
     last_states = [state.reshape(-1, state.shape[-1])[-1] for state in states]
     single = _call_or_catch(function, last_states, args)
+    _refuse_draws(name, single, _call_or_catch(function, last_states, args))
     if getattr(result, "shape", None) == expected:
         last_row = result.reshape(-1, owner.dim)[-1]
         differs = _is_different(last_row, single, last_states)
@@ -111,6 +112,20 @@ def _compare_with_single_state(
         raise ValueError(
             f"{name} must take many states at once, (..., d), components last "
             "(x[..., 0], not x[0] or x[:, 0]), got one for other axes"
+        )
+
+
+def _refuse_draws(name: str, first: Any, second: Any) -> None:
+    """Raise if two calls with the same state differ, as where noise is drawn inside."""
+    is_array = isinstance(first, np.ndarray) and isinstance(second, np.ndarray)
+    if not is_array or first.shape != second.shape:
+        return
+    # A parallel sum may round differently each time.
+    if not np.allclose(first, second, rtol=1e-9, atol=0.0, equal_nan=True):
+        raise ValueError(
+            f"{name} must give the same values for the same states, got two results "
+            f"{np.abs(first - second).max():.3g} apart: noise that is drawn in it belongs "
+            "in noise_cov"
         )
 
 

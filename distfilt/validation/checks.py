@@ -24,6 +24,7 @@ __all__ = [
     "check_increasing",
     "check_positive_semidefinite",
     "check_probabilities",
+    "format_number",
     "format_shape",
     "match_shape",
     "type_name",
@@ -115,6 +116,7 @@ def check_array(
     if not fits and shape is not None:
         raise ValueError(
             f"{name} must have shape {format_shape(shape)}, got {array.shape}"
+            f"{describe_misshape(array.shape, shape)}"
         )
     if finite and not all_finite(array):
         count = int((~np.isfinite(array)).sum())
@@ -193,6 +195,31 @@ def format_shape(shape: tuple[Any, ...]) -> str:
     names = ["..." if size is ... else str(size) for size in shape]
     text = ", ".join(names)
     return f"({text},)" if len(shape) == 1 else f"({text})"
+
+
+def describe_misshape(shape: tuple[int, ...], expected: tuple[Any, ...]) -> str:
+    """Return what to change about a column vector, or a number without an axis; mostly nothing.
+
+    >>> describe_misshape((2, 1), (2,)), describe_misshape((), (..., 1))
+    (': a column, give x[:, 0]', ': give [x], an array of one number')
+    """
+    size = expected[-1] if expected else None
+    if shape[-1:] == (1,) and len(shape) > 1 and shape[-2] == size != 1:
+        return ": a column, give x[:, 0]"
+    if shape == () and size == 1:
+        return ": give [x], an array of one number"
+    return ""
+
+
+def format_number(value: float) -> str:
+    """Write a number in six digits, or so that a large time keeps its microseconds.
+
+    >>> format_number(0.1 + 0.2), format_number(1.7e9 + 0.25), format_number(1e300)
+    ('0.3', '1700000000.25', '1e+300')
+    """
+    if not 1e5 <= abs(value) < 1e14:
+        return f"{value:g}"
+    return f"{value:.6f}".rstrip("0").rstrip(".")
 
 
 def check_positive_definite(value: Array, name: str) -> None:
@@ -298,8 +325,15 @@ def check_probabilities(value: Array, name: str) -> None:
     total = np.ravel(value.sum(axis=-1))
     error = np.abs(total - 1)
     # Strict, since for states far from zero a small missing weight moves the mean.
-    if error.max(initial=0.0) > 1e-9:
-        raise ValueError(f"{name} must sum to 1, got {total[error.argmax()]:.9g}")
+    largest = error.max(initial=0.0)
+    if largest > 1e-9:
+        got = total[error.argmax()]
+        if largest > 1e-4:
+            raise ValueError(f"{name} must sum to 1, got {got:.9g}")
+        raise ValueError(
+            f"{name} must sum to 1 up to 1e-9, got a sum that is {largest:.1e} off: divide "
+            "weights of single precision, or rounded ones, by their sum as float64"
+        )
 
 
 def check_increasing(value: Array, name: str) -> None:
@@ -315,7 +349,8 @@ def check_increasing(value: Array, name: str) -> None:
     if not_above.any():
         k = int(not_above.argmax())
         raise ValueError(
-            f"{name} must be strictly increasing, got {value[k + 1]:g} after {value[k]:g}"
+            f"{name} must be strictly increasing, got {format_number(value[k + 1])} after "
+            f"{format_number(value[k])}"
         )
 
 
@@ -372,7 +407,7 @@ def _describe_bound(side: str, bound: float) -> str:
         return "positive"
     if bound == 0 and side == "at_least":
         return "nonnegative"
-    return f"{side.replace('_', ' ')} {bound:g}"
+    return f"{side.replace('_', ' ')} {format_number(bound)}"
 
 
 _COMPARISONS = {

@@ -11,9 +11,16 @@ from math import isfinite
 from typing import Any, TypeVar, cast
 
 from .annotations import FINITE_FLOAT, CallContext, Constraint
+from .checks import InvalidArgumentError
 from .resolving import make_constraints
 
-__all__ = ["SignatureConstraints", "call_user", "skip_validation", "validated"]
+__all__ = [
+    "SignatureConstraints",
+    "call_user",
+    "check_signature",
+    "skip_validation",
+    "validated",
+]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -62,7 +69,8 @@ class SignatureConstraints:
         """Return the converted arguments by name, or raise an error for the first wrong one."""
         arguments = dict(zip(self.positional_names, args, strict=False)) | options
         if len(arguments) < len(args) + len(options):
-            # Too many arguments, or one of them twice: Python's own error says which.
+            self._refuse_positions(args)
+            # One of the arguments twice: Python's own error says which.
             signature(self.function).bind(*args, **options)
         # Shapes may refer to defaults too, which are not checked.
         context = CallContext(self.defaults | arguments)
@@ -78,6 +86,24 @@ class SignatureConstraints:
                 arguments[name] = value
                 context.arguments[name] = value
         return arguments
+
+
+    def _refuse_positions(self, args: tuple[Any, ...]) -> None:
+        """Refuse more arguments by position than there are, naming those to give by name."""
+        n_allowed = len(self.positional_names)
+        parameters = signature(self.function).parameters.values()
+        names = [p.name for p in parameters if p.kind is Parameter.KEYWORD_ONLY]
+        has_more = any(p.kind is Parameter.VAR_POSITIONAL for p in parameters)
+        if len(args) <= n_allowed or has_more or not names:
+            return
+        name = self.function.__name__
+        options = ", ".join(f"{option}=" for option in names)
+        example = f"{names[0]}={args[n_allowed]!r}"
+        hint = f", such as {example}" if len(example) < 40 else ""
+        raise InvalidArgumentError(
+            f"{name}() must have at most {n_allowed} of its arguments by position, got "
+            f"{len(args)}: give {options} by name{hint}"
+        )
 
 
 class _Flag:
@@ -187,6 +213,27 @@ def skip_validation() -> Iterator[None]:
         yield
     finally:
         _NESTED.reset(token)
+
+
+def check_signature(function: Any, name: str, parameters: str) -> None:
+    """Refuse a function that cannot be called with these parameters, such as "x, t, dt".
+
+    Examples
+    --------
+    >>> check_signature(lambda x: x, "transition", "x, t, dt")
+    Traceback (most recent call last):
+    distfilt.validation.InvalidArgumentError: transition must be a function of (x, t, dt), got ...
+    """
+    try:
+        declared = signature(function)
+    except (TypeError, ValueError):
+        return  # some functions in C do not tell
+    try:
+        declared.bind(*parameters.split(", "))
+    except TypeError:
+        raise InvalidArgumentError(
+            f"{name} must be a function of ({parameters}), got one of {declared}"
+        ) from None
 
 
 def call_user(function: Callable[..., Any], *args: Any, **options: Any) -> Any:

@@ -194,7 +194,7 @@ def test_entropy_shrinks_the_ensemble_and_debiasing_restores_it() -> None:
 def test_weights_in_place_of_logarithms_warn() -> None:
     """They are nonnegative and sum to one."""
     x, _, weights = _case(9, 60, 2)
-    message = "must be logarithms, got numbers with a sum of 1"
+    message = "log_weights must be logarithms, got numbers from"
     with pytest.warns(RuntimeWarning, match=message):
         coupling.transform_ensemble(x, weights)
 

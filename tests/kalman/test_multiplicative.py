@@ -184,8 +184,12 @@ def test_errors_are_propagated_by_the_derivative_of_the_transition_in_the_chart(
     assert np.allclose(run.covariances[0], expected, atol=1e-6)
 
 
-def test_sensors_of_increments_equal_the_kalman_filter_of_a_doubled_state() -> None:
-    """The state (x, previous x), whose differences are observed directly."""
+def test_sensors_of_increments_equal_the_kalman_filter_of_earlier_states() -> None:
+    """The state (x, earlier x, earlier x), one earlier for each observed increment.
+
+    An earlier state is replaced by the present one when its increment was observed, not when it
+    was missing.
+    """
     rng = np.random.default_rng(5)
     model = constant_velocity(sigma=0.3)
     d = 4
@@ -203,32 +207,38 @@ def test_sensors_of_increments_equal_the_kalman_filter_of_a_doubled_state() -> N
         sensors=[increment([0, 3], std=0.2), component([1], std=0.3)],
         times=[0.5, 1.0, 1.5, 2.0],
     )
-    # (x', x) from (x, previous x): the second block is a copy.
-    zero = np.zeros((d, d))
-    transition = np.block([[model.F(0.5), zero], [np.eye(d), zero]])
-    noise_cov = block_diag(model.Q(0.0, 0.5), zero)
-    h = np.zeros((3, 2 * d))
+    noise_cov = block_diag(model.Q(0.0, 0.5), np.zeros((2 * d, 2 * d)))
+    h = np.zeros((3, 3 * d))
     # Increments of components 0 and 3, and component 1 itself
     h[0, [0, d]] = 1.0, -1.0
-    h[1, [3, d + 3]] = 1.0, -1.0
+    h[1, [3, 2 * d + 3]] = 1.0, -1.0
     h[2, 1] = 1.0
-    expected = kalman_filter(
-        np.concatenate([mean, mean]),
-        # The state before the prior is never observed: any covariance will do.
-        block_diag(cov, cov),
-        y,
-        F=transition,
-        Q=noise_cov,
-        H=h,
-        R=np.diag([0.04, 0.04, 0.09]),
-    )
-    means = expected.means[..., :d]
-    covs = np.broadcast_to(expected.covariances[..., :d, :d], run.covariances.shape)
-    np.testing.assert_allclose(run.means, means, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(run.covariances, covs, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(
-        run.log_likelihood, expected.log_likelihood, rtol=0, atol=1e-7
-    )
+    for r in range(3):
+        transitions = []
+        for k in range(4):
+            transition = block_diag(model.F(0.5), np.eye(d), np.eye(d))
+            for j in range(2):
+                # At the first step, and after an observation, the present state is copied.
+                if k == 0 or not np.isnan(y[k - 1, r, j]):
+                    rows = slice((1 + j) * d, (2 + j) * d)
+                    transition[rows] = 0.0
+                    transition[rows, :d] = np.eye(d)
+            transitions.append(transition)
+        expected = kalman_filter(
+            np.tile(mean, 3),
+            # The earlier states are replaced before they are observed.
+            block_diag(cov, cov, cov),
+            y[:, r],
+            F=np.array(transitions),
+            Q=noise_cov,
+            H=h,
+            R=np.diag([0.04, 0.04, 0.09]),
+        )
+        np.testing.assert_allclose(run.means[:, r], expected.means[:, :d], atol=1e-8)
+        covs = expected.covariances[:, :d, :d]
+        np.testing.assert_allclose(run.covariances[:, r], covs, atol=1e-8)
+        logs = expected.log_likelihood
+        np.testing.assert_allclose(run.log_likelihood[:, r], logs, atol=1e-7)
 
 
 def test_the_uncertainty_of_an_attitude_is_consistent_and_its_length_conserved() -> (

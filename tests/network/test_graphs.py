@@ -130,12 +130,12 @@ def test_edges_count_once_and_run_from_sender_to_receiver() -> None:
 
 
 def test_graphs_of_networkx_keep_their_labels_or_their_order() -> None:
-    # In the order of the nodes: camera 0, screen 1, log 2; from sender to receiver.
-    digraph = nx.DiGraph([("camera", "screen"), ("screen", "log")])
+    # In the order of the nodes: screen 0, camera 1, log 2; from receiver to sender.
+    digraph = nx.DiGraph([("screen", "camera"), ("log", "screen")])
     graph = Graph.from_networkx(digraph)
     assert graph.is_directed
-    assert graph.neighbours(0) == ()
-    assert graph.neighbours(1) == (0,)
+    assert graph.neighbours(0) == (1,)
+    assert graph.neighbours(1) == ()
     # Parallel edges count once.
     parallel = nx.MultiGraph([(5, 7), (5, 7), (7, 9)])
     assert Graph.from_networkx(parallel).senders.size == 4

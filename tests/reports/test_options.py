@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from distfilt import density, filters, network
-from distfilt.mixtures import GaussianMixture, target_fusion
+from distfilt.mixtures import target_fusion
 from distfilt.models import Model, Swarm
 from distfilt.network import Faults, graphs
-from distfilt.sensors import Sensor, component, distance
+from distfilt.sensors import component, distance
 from distfilt.updates import enkf, enkf_exact
 from distfilt.updates.gaussian import exact_forecast
 
@@ -36,7 +36,6 @@ def bend(x: np.ndarray, t: float, dt: float) -> np.ndarray:
 
 MODEL = Model(2, bend, lambda t, dt: 0.05 * dt * np.eye(2))
 OTHER_MODEL = Model(2, bend, lambda t, dt: 0.5 * dt * np.eye(2))
-STILL = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
 FAILING = Model(
     2,
     lambda x, t, dt: np.where(x > 50, np.nan, x),
@@ -46,13 +45,9 @@ SENSORS = [component([0], std=0.5), distance([0, 1], std=0.5), None]
 OTHER_SENSORS = [component([0], std=0.5), distance([0, 1], std=0.1), None]
 
 
-def last_of(beliefs: np.ndarray, channel: network.Channel) -> np.ndarray:
-    """Return a fusion of members or vectors: everybody's average, without messages."""
+def pull_to_average(beliefs: np.ndarray, channel: network.Channel) -> np.ndarray:
+    """Move every agent's members towards the average of all, without messages."""
     return beliefs + 0.1 * (beliefs.mean(axis=-3, keepdims=True) - beliefs)
-
-
-def scatter(prior: Any, runs: tuple[int, ...]) -> dict[str, Any]:
-    return {"prior": prior, "runs": runs}
 
 
 def outcome(make: Callable[..., Any], options: dict[str, Any]) -> Any:
@@ -113,35 +108,30 @@ BATCHED = {
         {"on_error": "keep"},
     ),
     "lag": ({}, {"lag": 2}),
+    "record_evidence": ({}, {"record_evidence": True}),
 }
 SHARING = {
     "share_observations": ({}, {"share_observations": False}),
     "exchange_interval": ({"lag": 3}, {"exchange_interval": 1.0}),
 }
+SPLIT = {"split_threshold": 0.01, "max_components": 4, "n_components": 2}
 MIXTURE = {
     "target_dim": (
         {"fusion": partial(target_fusion, target_dim=1)},
         {"target_dim": 2, "fusion": partial(target_fusion, target_dim=2)},
     ),
-    "n_components": (
-        {"split_threshold": 1e-6, "max_components": 12, "n_components": 6},
-        {"n_components": 2},
-    ),
-    "max_components": (
-        {"split_threshold": 1e-6, "n_components": 2, "max_components": 12},
-        {"max_components": 3},
-    ),
-    "split_threshold": ({"max_components": 12}, {"split_threshold": 1e-6}),
-    "split_scale": (
-        {"split_threshold": 1e-3, "max_components": 12},
-        {"split_scale": [1e-3, 1e3]},
-    ),
+    "n_components": (SPLIT, {"n_components": 1}),
+    "max_components": (SPLIT, {"max_components": 3}),
+    "split_threshold": ({"max_components": 4, "n_components": 2}, SPLIT),
+    "split_scale": (SPLIT, {"split_scale": [1e-3, 1e3]}),
 }
 
 BASE = {"model": MODEL, "sensors": SENSORS, "graph": graphs.path(3)}
 PLACES = np.random.default_rng(0).random((4, 3, 2))
 SWARM = density.FokkerPlanck(Swarm(lambda x, t: 0.2 - x, 0.02), density.Grid((6, 6)))
-OTHER_SWARM = density.FokkerPlanck(Swarm(lambda x, t: 0 * x, 0.02), density.Grid((6, 6)))
+OTHER_SWARM = density.FokkerPlanck(
+    Swarm(lambda x, t: 0 * x, 0.02), density.Grid((6, 6))
+)
 DENSITY_BASE = {
     "model": SWARM,
     "sensors": 3,
@@ -174,7 +164,7 @@ CASES: dict[str, tuple[type[Any], dict[str, Any], dict[str, Any]]] = {
             **SHARED,
             **BATCHED,
             **SHARING,
-            "fusion": ({}, {"fusion": last_of}),
+            "fusion": ({}, {"fusion": pull_to_average}),
             "members": ({}, {"members": 31}),
             "update": ({"update": enkf}, {"update": enkf_exact}),
             "forecast": ({}, {"forecast": exact_forecast}),
@@ -187,7 +177,7 @@ CASES: dict[str, tuple[type[Any], dict[str, Any], dict[str, Any]]] = {
             **SHARED,
             **BATCHED,
             **SHARING,
-            "fusion": ({}, {"fusion": last_of}),
+            "fusion": ({}, {"fusion": pull_to_average}),
             "members": ({}, {"members": 301}),
             "ess_threshold": ({}, {"ess_threshold": 1.0}),
             "jitter": ({}, {"jitter": 0.2}),

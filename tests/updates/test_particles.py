@@ -64,8 +64,14 @@ def test_weights_by_bayes_rule_with_a_missing_component() -> None:
         marginal = _normalise(prior - 0.5 * innovation[:, k] ** 2 / noise[k, k])
         log_weights = reweight(prior, h, partial_y, noise)
         assert np.allclose(np.exp(log_weights), marginal)
-    # A component that one particle cannot predict is missing for all of them.
+    # A particle that cannot predict what was seen contradicts it.
     h[3, 1] = np.nan
+    sees = np.arange(6) != 3
+    weights = np.exp(reweight(prior, h, y, noise))
+    assert weights[3] == 0
+    assert np.allclose(weights[sees], full[sees] / full[sees].sum())
+    # A component that no particle can predict is missing.
+    h[:, 1] = np.nan
     marginal = _normalise(prior - 0.5 * innovation[:, 0] ** 2 / noise[0, 0])
     assert np.allclose(np.exp(reweight(prior, h, y, noise)), marginal)
 

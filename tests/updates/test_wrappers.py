@@ -335,8 +335,8 @@ def test_localised_observations_on_a_ring_are_assimilated_in_turn(
     [
         # From place 7 the others are 1 and 2.5 away, the shorter way round.
         ([2], [-0.5], [[0.9]], [0.5, 1.25, 0.0]),
-        # Correlated observations are one group: the nearest one counts.
-        ([0, 2], [1.0, -0.5], R, [0.0, 0.75, 0.0]),
+        # Correlated observations in one place are one group.
+        ([0, 0], [1.0, -0.5], R, [0.0, 0.75, 0.5]),
     ],
 )
 def test_distances_on_a_ring_are_the_shorter_way_round(

@@ -1,0 +1,212 @@
+"""Beliefs about times between two steps, for delayed observations of times never stepped to.
+
+A state x(τ) between two kept ones is Gaussian given them, and then independent of all others and of
+what was observed so far. With the model's steps from t₀ to τ and from τ to t₁, linear about the
+earlier state, x(τ) = f(x₀) + w with w ~ N(0, Q₁) and x₁ = F₂ x(τ) + w' with w' ~ N(0, Q₂), so that
+
+    x(τ) = f(x₀) + G (x₁ - f₂(f(x₀))) + e,  G = Q₁ F₂ᵀ S⁺,  S = F₂ Q₁ F₂ᵀ + Q₂,
+    e ~ N(0, Q₁ - G F₂ Q₁).
+
+For a linear model this is exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ..linalg import deviations, symmetrise, to_unit_variances
+from ..models import Model
+from ..periods import wrap_differences
+from ..validation import Array, format_number
+from .observations import Observation
+
+if TYPE_CHECKING:
+    from .states import SensorState
+
+__all__ = ["Bridge", "bridge_states", "insert_times"]
+
+
+class Bridge(NamedTuple):
+    """The law of the states x(τ) given the earlier states x₀ and later ones."""
+
+    forecast: Array
+    """f(x₀), (..., d)."""
+    after: Array
+    """Its forecast at the later time, f₂(f(x₀)), (..., d)."""
+    gain: Array
+    """G, (..., d, d)."""
+    slope_before: Array
+    """The derivative of f at x₀, (..., d, d)."""
+    slope_after: Array
+    """The derivative F₂ of f₂ at f(x₀), (..., d, d)."""
+    cov: Array
+    """The covariance of e, (..., d, d)."""
+
+
+def bridge_states(
+    model: Model, before: Array, times: tuple[float, float, float], std: Array
+) -> Bridge:
+    """Return the law of the states at the second of three times, given those at the others.
+
+    Of a random walk it is the mean of both in the middle, with half of one step's variance:
+
+    >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: dt * np.eye(1))
+    >>> law = bridge_states(walk, np.zeros((1, 1)), (0.0, 1.0, 2.0), np.ones((1, 1)))
+    >>> law.gain.ravel(), law.cov.ravel()
+    (array([0.5]), array([0.5]))
+    """
+    start, t, end = times
+    forecast = model.step(before, start, t - start)
+    slope_before = model.jacobian(before, start, t - start, std=std)
+    slope_after = model.jacobian(forecast, t, end - t, std=std)
+    first = model.Q(start, t - start)
+    cross = slope_after @ first
+    # The pseudo-inverse has no units if the variances are one.
+    scaled, unit = to_unit_variances(
+        symmetrise(cross @ slope_after.mT + model.Q(t, end - t))
+    )
+    inverse = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True)
+    inverse = inverse / (unit[..., :, None] * unit[..., None, :])
+    gain = cross.mT @ inverse
+    after = model.step(forecast, t, end - t)
+    cov = symmetrise(first - gain @ cross)
+    return Bridge(forecast, after, gain, slope_before, slope_after, cov)
+
+
+def draw_bridge(
+    model: Model,
+    before: Array,
+    after: Array,
+    times: tuple[float, float, float],
+    normal: Array,
+    periods: Any,
+) -> Array:
+    """Return states (..., N, d) at the second of three times, from those of the others.
+
+    `normal` holds standard normal draws that broadcast to the states.
+    """
+    spread = before.std(axis=-2, keepdims=True)
+    law = bridge_states(model, before, times, np.broadcast_to(spread, before.shape))
+    # e = V √λ z, whatever the rank of its covariance
+    values, vectors = np.linalg.eigh(law.cov)
+    scaled = np.sqrt(np.maximum(values, 0.0)) * normal
+    noise = (vectors @ scaled[..., None])[..., 0]
+    innovation = wrap_differences(after - law.after, periods)
+    return np.asarray(law.forecast + (law.gain @ innovation[..., None])[..., 0] + noise)
+
+
+def insert_times(
+    f: Any,
+    delayed: Sequence[Observation],
+    state: Any,
+    t: float,
+    *,
+    reuse_rng: bool,
+) -> Any:
+    """Return the state with beliefs about the times of delayed observations that it does not keep.
+
+    A time within the step that is taken is inserted behind its forecast, so that the state
+    returned is that at `t` then.
+    """
+    if not f.lag:
+        return state
+    for t_obs in sorted({observation.t for observation in delayed}):
+        if t_obs > state.t and not _is_kept(t_obs, (state.t, t), t):
+            state = _forecast(f, state, t, t_obs, reuse_rng=reuse_rng)
+        times = (*state.times, state.t)
+        if _is_kept(t_obs, times, t) or not times[0] < t_obs < times[-1]:
+            continue
+        state = f.insert_time(state, t_obs)
+    return state
+
+
+def _is_kept(t_obs: float, times: Sequence[float], t: float) -> bool:
+    """Whether a time is one of these to rounding."""
+    shortest = min((b - a for a, b in pairwise((*times, t)) if b > a), default=0.0)
+    tolerance = min(1e-9 * max(1.0, abs(t_obs)), 1e-3 * shortest)
+    return min(abs(time - t_obs) for time in times) <= tolerance
+
+
+def _forecast(
+    f: Any, state: SensorState, t: float, t_obs: float, *, reuse_rng: bool
+) -> Any:
+    """Return the forecast at `t`, without an exchange."""
+    if t_obs >= t:
+        return state
+    if f.exchange_interval is not None:
+        raise ValueError(
+            f"delayed must be of times up to the state's own, {format_number(state.t)}, for "
+            f"agents that exchange at intervals, got {format_number(t_obs)}"
+        )
+    quiet = f.replace(graph=None)
+    return quiet._advance(state, t, [None] * f.n_agents, (), reuse_rng=reuse_rng)
+
+
+def split_history(state: Any, t_obs: float) -> tuple[int, float, float]:
+    """Return how many kept times are before `t_obs`, and the times on both of its sides."""
+    times = (*state.times, state.t)
+    place = sum(time < t_obs for time in times)
+    return place, times[place - 1], times[place]
+
+
+def insert_gaussian(f: Any, state: Any, t_obs: float) -> Any:
+    """Return a Gaussian state with the belief about a time between two that it keeps."""
+    place, start, end = split_history(state, t_obs)
+    d = state.dim
+    n = len(state.history) + 1
+    mean = state.joint_means
+    cov = state.joint_covariances
+    # The latest time is the first block.
+    after = slice((n - 1 - place) * d, (n - place) * d)
+    before = slice((n - place) * d, (n - place + 1) * d)
+    std = deviations(cov[..., before, before])
+    law = bridge_states(f.model, mean[..., before], (start, t_obs, end), std)
+    innovation = wrap_differences(mean[..., after] - law.after, f.periods)
+    new_mean = law.forecast + (law.gain @ innovation[..., None])[..., 0]
+    # x(τ) = (F₁ - G F₂ F₁) x₀ + G x₁ + e
+    rows = np.zeros((*mean.shape[:-1], d, mean.shape[-1]))
+    rows[..., after] = law.gain
+    rows[..., before] = (np.eye(d) - law.gain @ law.slope_after) @ law.slope_before
+    cross = rows @ cov
+    variance = cross @ rows.mT + law.cov
+    # The new block stands between the two.
+    cut = after.stop
+    cov = np.block(
+        [
+            [cov[..., :cut, :cut], cross[..., :cut].mT, cov[..., :cut, cut:]],
+            [cross[..., :cut], variance, cross[..., cut:]],
+            [cov[..., cut:, :cut], cross[..., cut:].mT, cov[..., cut:, cut:]],
+        ]
+    )
+    mean = np.concatenate([mean[..., :cut], new_mean, mean[..., cut:]], axis=-1)
+    times = (*state.times[:place], t_obs, *state.times[place:])[-f.lag :]
+    size = (len(times) + 1) * d
+    return state.replace(
+        joint_means=mean[..., :size],
+        joint_covariances=symmetrise(cov[..., :size, :size]),
+        history=times[::-1],
+    )
+
+
+def insert_members(f: Any, state: Any, t_obs: float) -> Any:
+    """Return a state of members with those of a time between two that it keeps."""
+    from .step import copy_rng
+
+    place, start, end = split_history(state, t_obs)
+    beliefs = [*[belief for _, belief in state.history], state.belief]
+    rng = copy_rng(state.rng)
+    drawn = draw_bridge(
+        f.model,
+        beliefs[place - 1],
+        beliefs[place],
+        (start, t_obs, end),
+        f.draw_normal(state.belief.shape, rng),
+        f.periods,
+    )
+    history = list(state.history)
+    history.insert(place, (t_obs, drawn))
+    return state.replace(history=tuple(history[-f.lag :]), rng=rng)

@@ -1,0 +1,169 @@
+"""Sensors of changes: the earlier time with which each of them compares the present state.
+
+A sensor of changes compares the present state with that at its own last observation, whatever other
+sensors have observed in between. A state keeps these times, and the beliefs about those of them that
+its lag does not keep. They are conditioned on all later observations, as the past of a lag is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ..sensors import Sensor
+from ..validation import Array, Mask, format_number
+from .observations import Observation
+
+if TYPE_CHECKING:
+    from .states import SensorState
+    from .step import Received
+
+__all__ = ["Previous", "References", "Source"]
+
+Source = tuple[int, int]
+"""An agent, and the number of its sensor."""
+
+
+class Previous(NamedTuple):
+    """Earlier states, and the numbers of the observations that are compared with them."""
+
+    members: Array
+    """The states, (*runs, G, N, d)."""
+    cells: Mask
+    """Which numbers of a group, (G, M) or (*runs, G, M)."""
+
+
+class References:
+    """The times with which sensors of changes compare in one step.
+
+    Attributes
+    ----------
+    last, after : dict of Source to (float or ndarray)
+        The time of each sensor's last observation before the step, and after it: one for all
+        runs and components, or (*runs, m).
+    times : tuple of float
+        The earlier times whose beliefs the step has to keep, besides those of the lag.
+    sources : dict of int to list
+        The sources of the present observations that each agent has, with their sizes, in order.
+
+    Examples
+    --------
+    >>> from distfilt.filters import EnsembleFilter
+    >>> from distfilt.models import constant_velocity
+    >>> from distfilt.sensors import component, increment
+    >>> walk = constant_velocity(sigma=0.1, axes=1)
+    >>> sensors = [increment([0], std=0.1), component([0], std=1.0)]
+    >>> f = EnsembleFilter(walk, [sensors], members=5)
+    >>> state = f.start(([0.0, 1.0], np.eye(2)), rng=np.random.default_rng(0))
+    >>> state = f.step(state, 1.0, [Observation(1.0, 0, [1.0], 1)])
+    >>> References(state, 2.0, [[Observation(2.0, 0, [2.0])]], {(0, 0)}).last
+    {(0, 0): 0.0}
+    """
+
+    def __init__(
+        self,
+        state: SensorState,
+        t: float,
+        observations: Iterable[Sequence[Observation]],
+        sources: Iterable[Source],
+    ) -> None:
+        self.t = t
+        # Before its first observation a sensor compares with the start.
+        self.last: dict[Source, Any] = dict.fromkeys(sources, state.t)
+        for agent, number, times in state.last_changes:
+            self.last[agent, number] = times
+        self.after = self.last.copy()
+        for of_agent in observations:
+            for observation in of_agent:
+                self._add(observation)
+        self.kept = _list_times(self.after.values()) - {t}
+        needed = (_list_times(self.last.values()) | self.kept) - {t}
+        if state.t not in self.kept:
+            # The members with which the step begins serve without a copy.
+            needed -= {state.t}
+        held = {time for time, _ in state.references}
+        held |= {state.t, *state.times} if t > state.t else set(state.times)
+        self.times = tuple(sorted(needed & held))
+        self.sources: dict[int, list[tuple[Source | None, int]]] = {}
+
+    def _add(self, observation: Observation) -> None:
+        """Note that a sensor observes now, in the runs and components that are not missing."""
+        number = observation.sensor
+        if isinstance(number, Sensor) or (observation.agent, number) not in self.after:
+            return
+        source = observation.agent, number
+        present = ~np.isnan(observation.value)
+        if present.all():
+            self.after[source] = self.t
+        else:
+            self.after[source] = np.where(present, self.t, self.after[source])
+
+    def receive(self, agent: int, observation: Observation) -> None:
+        """Note that an agent has a present observation, after those noted before."""
+        number = observation.sensor
+        source = None
+        if not isinstance(number, Sensor) and (observation.agent, number) in self.last:
+            source = observation.agent, number
+        size = observation.value.shape[-1]
+        self.sources.setdefault(agent, []).append((source, size))
+
+    def find(
+        self, group: Received, past: Sequence[Array], times: Sequence[float], origin: Any
+    ) -> list[Previous]:
+        """Return the earlier members with which a group's present observations are compared.
+
+        Parameters
+        ----------
+        group : Received
+        past, times : sequence of ndarray, and of float
+            The members of the earlier times that the step keeps, and these times.
+        origin : (float, ndarray) or None
+            The time and the members with which the step begins, if it has a length.
+        """
+        rows = [self._times_of(agent) for agent in group.agents.tolist()]
+        runs = np.broadcast_shapes(*[row.shape[:-1] for row in rows])
+        m = group.target.shape[-1]
+        cells = np.stack([np.broadcast_to(row, (*runs, m)) for row in rows], axis=-2)
+        result = []
+        for time in sorted(_list_times([cells])):
+            if time in times:
+                members = past[times.index(time)]
+            elif origin is not None and time == origin[0]:
+                members = origin[1]
+            else:
+                raise ValueError(
+                    "previous must be the states at the previous observation time, with which "
+                    "a sensor of changes compares; there is none at t = "
+                    f"{format_number(self.t)}"
+                )
+            result.append(Previous(members[..., group.rows, :, :], cells == time))
+        return result
+
+    def _times_of(self, agent: int) -> Array:
+        """Return the times with which an agent's present numbers compare, NaN without one."""
+        parts = []
+        for source, size in self.sources[agent]:
+            times = np.nan if source is None else self.last[source]
+            shape = (*np.shape(times)[:-1], size)
+            parts.append(np.broadcast_to(times, shape))
+        runs = np.broadcast_shapes(*[part.shape[:-1] for part in parts])
+        parts = [np.broadcast_to(part, (*runs, part.shape[-1])) for part in parts]
+        return np.concatenate(parts, axis=-1)
+
+    @property
+    def last_changes(self) -> tuple[tuple[int, int, Any], ...]:
+        """The times after the step, as a state keeps them."""
+        return tuple([(*source, times) for source, times in self.after.items()])
+
+
+def _list_times(values: Iterable[Any]) -> set[float]:
+    """Return the different numbers in arrays and numbers, without NaN."""
+    times: set[float] = set()
+    for value in values:
+        if isinstance(value, np.ndarray):
+            times.update(np.unique(value[~np.isnan(value)]).tolist())
+        else:
+            times.add(value)
+    return times

@@ -1,0 +1,396 @@
+"""Circular components: their periods, and states and observations on one branch.
+
+A component with a period p, such as an angle, is the same after p. Numbers that mean the same
+direction may differ by a multiple of it, so a mean or a difference of two numbers makes sense
+only on one branch: where all of them lie about a common centre. The functions of this module
+move numbers by whole periods and change nothing else; those on the branch keep all their bits.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from .validation import Array, InvalidArgumentError
+from .validation.first_use import mark_checked, needs_check
+
+if TYPE_CHECKING:
+    from .models import Model
+    from .sensors import Sensor
+
+__all__: list[str] = []
+
+Periods = tuple[float | None, ...]
+"""A period for each component, None for one that is not circular; () if none is."""
+
+if TYPE_CHECKING:
+    PeriodsArgument = Sequence[float | None] | Mapping[Any, float | None]
+else:
+    # Checked by `read_periods`, which converts it.
+    PeriodsArgument = Any
+
+# A function is linear up to wraps if it differs from its tangent by less, relative to its range.
+_LINEAR = 1e-5
+# How much a function may change when a circular component turns once, by rounding.
+_SAME = 1e-4
+
+
+def read_periods(periods: Any, dim: int, names: Sequence[str] = ()) -> Periods:
+    """Return a period or None for each component, of a sequence or of a mapping.
+
+    Parameters
+    ----------
+    periods : sequence of (float or None), or mapping
+        One entry for each component; or the periods of the circular ones, by index or name.
+    dim : int
+        Number of components.
+    names : sequence of str
+        Their names, if they have any.
+
+    Examples
+    --------
+    >>> read_periods((None, 6.0), 2), read_periods({"b": 6.0}, 2, ("a", "b"))
+    ((None, 6.0), (None, 6.0))
+    >>> read_periods((None, None), 2), read_periods((), 2)
+    ((), ())
+    >>> read_periods({2: 6.0}, 2)
+    Traceback (most recent call last):
+    ValueError: periods must have keys among 0, 1, got 2
+    """
+    if isinstance(periods, Mapping):
+        entries: list[Any] = [None] * dim
+        places = dict(enumerate(range(dim))) | {n: k for k, n in enumerate(names)}
+        for key, period in periods.items():
+            if key not in places:
+                raise ValueError(
+                    f"periods must have keys among {', '.join(map(str, places))}, got {key}"
+                )
+            entries[places[key]] = period
+    elif isinstance(periods, str) or not np.iterable(periods):
+        raise InvalidArgumentError(
+            f"periods must be a tuple with {dim} entries, or a mapping of components to "
+            f"periods, got {periods!r}"
+        )
+    else:
+        entries = list(periods)
+    if entries and len(entries) != dim:
+        raise ValueError(f"periods must have {dim} entries, got {len(entries)}")
+    result = tuple([_read_period(period) for period in entries])
+    return result if any(period is not None for period in result) else ()
+
+
+def _read_period(period: Any) -> float | None:
+    if period is None:
+        return None
+    is_number = np.ndim(period) == 0 and isinstance(period, int | float | np.number)
+    if not is_number or isinstance(period, bool):
+        raise InvalidArgumentError(
+            f"periods must have numbers or None, got {period!r}"
+        )
+    if not 0 < period < np.inf:
+        raise ValueError(f"periods must be positive and finite, got {period}")
+    return float(period)
+
+
+def _circular(periods: Periods) -> tuple[list[int], Array]:
+    """Return the indices of the circular components, and their periods."""
+    places = [k for k, period in enumerate(periods) if period is not None]
+    return places, np.array([periods[k] for k in places], dtype=np.float64)
+
+
+def align(values: Array, reference: Array, periods: Periods) -> Array:
+    """Bring values (..., d) onto the branch of a reference, up to half a period from it.
+
+    Values that are there already are returned as they are.
+
+    >>> align(np.array([3.0, 3.0]), np.array([-3.0, -3.0]), (2 * np.pi, None)).round(4)
+    array([-3.2832,  3.    ])
+    """
+    if not periods:
+        return values
+    places, p = _circular(periods)
+    turns = _count_turns(values[..., places] - reference[..., places], p)
+    if not turns.any():
+        return values
+    result = np.array(np.broadcast_to(values, (*turns.shape[:-1], len(periods))))
+    result[..., places] -= p * turns
+    return result
+
+
+def _count_turns(difference: Array, p: Array) -> Array:
+    """Return how many whole periods to take off a difference; none where it is missing."""
+    # A difference d - p k lies in [-p/2, p/2).
+    turns: Array = np.floor(difference / p + 0.5)
+    return np.where(np.isfinite(turns), turns, 0.0)
+
+
+def wrap_differences(differences: Array, periods: Periods) -> Array:
+    """Return differences (..., d) with the circular ones in [-period/2, period/2)."""
+    return align(differences, np.zeros(len(periods)), periods)
+
+
+def circular_mean(
+    members: Array, periods: Periods, weights: Array | None = None
+) -> Array:
+    """Return the directions of mean vectors of members (..., N, d), as (..., 1, d).
+
+    Components that are not circular are zero.
+
+    >>> circular_mean(np.array([[3.0], [-3.0]]), (2 * np.pi,)).round(4)
+    array([[3.1416]])
+    """
+    places, p = _circular(periods)
+    phases = np.exp(2j * np.pi / p * members[..., places])
+    if weights is not None:
+        phases = weights[..., None] * phases
+    vectors = phases.sum(axis=-2, keepdims=True)
+    result = np.zeros((*members.shape[:-2], 1, members.shape[-1]))
+    result[..., places] = np.angle(vectors) * p / (2 * np.pi)
+    return result
+
+
+def fold(members: Array, periods: Periods, weights: Array | None = None) -> Array:
+    """Bring members (..., N, d) onto the branch about their circular mean."""
+    if not periods:
+        return members
+    return align(members, circular_mean(members, periods, weights), periods)
+
+
+def fold_torn(members: Array, periods: Periods) -> Array:
+    """Bring members (..., N, d) onto one branch where a cut has torn them.
+
+    That is where they lie within about one period and their variance falls below half by it.
+    Members that are spread wider than the circle stay on the line.
+    """
+    if not periods:
+        return members
+    folded = fold(members, periods)
+    if folded is members:
+        return members
+    places, p = _circular(periods)
+    is_torn = 2 * folded.var(axis=-2) < members.var(axis=-2)
+    # Numbers with a cut lie within one period, but for the noise that was added since.
+    is_torn[..., places] &= np.ptp(members[..., places], axis=-2) < 1.25 * p
+    return np.where(is_torn[..., None, :], folded, members)
+
+
+def settle(
+    members: Array, periods: Periods, weights: Array | None = None
+) -> Array:
+    """Shift all members (..., N, d) alike, so that their mean is in [-period/2, period/2)."""
+    if not periods:
+        return members
+    if weights is None:
+        mean = members.mean(axis=-2, keepdims=True)
+    else:
+        mean = weights[..., None, :] @ members
+    shift = wrap_differences(mean, periods) - mean
+    # Exactly zero where nothing turns.
+    return members + shift if shift.any() else members
+
+
+def gather(
+    values: Array,
+    bring_near: Callable[[Array, Array], Array],
+    tangent: Callable[[], Array | None],
+    fallback: Callable[[], Array],
+) -> Array:
+    """Bring a function's values at N points (..., N, m) onto one branch.
+
+    Where the values lie within half a period, there is only one. Otherwise the function may be
+    linear up to wraps, as that of a compass is: then the branch continues the tangent at the
+    points' mean. If it is not, each value is brought near that of `fallback`.
+
+    Parameters
+    ----------
+    values : ndarray, (..., N, m)
+    bring_near : callable
+        ``bring_near(values, reference)``, on the branch of the reference.
+    tangent, fallback : callable
+        References (..., N, m) or (..., 1, m); a tangent may be None if there is none.
+    """
+    by_first = bring_near(values, values[..., :1, :])
+    high = np.fmax.reduce(by_first, axis=-2, keepdims=True)
+    low = np.fmin.reduce(by_first, axis=-2, keepdims=True)
+    # Within half a period the largest value is on the branch of the smallest.
+    rounding = 1e-9 * (1 + np.abs(high) + np.abs(low))
+    is_wide = np.abs(bring_near(high, low) - high) > rounding
+    if not is_wide.any():
+        return by_first
+    wide = bring_near(values, fallback())
+    line = tangent()
+    if line is not None:
+        by_line = bring_near(values, line)
+        error = np.abs(by_line - line).max(axis=-2, keepdims=True)
+        is_linear = error <= _LINEAR * np.ptp(line, axis=-2, keepdims=True)
+        wide = np.where(is_linear, by_line, wide)
+    return np.where(is_wide, wide, by_first)
+
+
+def step_members(model: Model, x: Array, t: float, dt: float) -> Array:
+    """Move states (..., N, d) without noise; with declared periods they stay on one branch.
+
+    >>> from distfilt.models import Model
+    >>> from distfilt.sensors import wrap
+    >>> turn = Model(
+    ...     1,
+    ...     lambda x, t, dt: wrap(x + 0.2),
+    ...     lambda t, dt: np.zeros((1, 1)),
+    ...     periods=(2 * np.pi,),
+    ... )
+    >>> step_members(turn, np.array([[2.9], [3.0]]), 0.0, 1.0)
+    array([[3.1],
+           [3.2]])
+    """
+    values = model.step(x, t, dt)
+    periods = cast(Periods, model.periods)
+    if not periods:
+        return values
+    centre = x.mean(axis=-2)
+    check_transition(model, centre, t, dt)
+
+    def bring_near(moved: Array, reference: Array) -> Array:
+        return align(moved, reference, periods)
+
+    def tangent() -> Array:
+        # f(m) + F (x_i - m)
+        slope = model.jacobian(centre, t, dt)
+        offsets = x - centre[..., None, :]
+        return model.step(centre, t, dt)[..., None, :] + offsets @ slope.mT
+
+    def fallback() -> Array:
+        # Every member goes on from its place, by about the mean displacement.
+        return x + circular_mean(values - x, periods)
+
+    return gather(values, bring_near, tangent, fallback)
+
+
+def check_transition(model: Model, x: Array, t: float, dt: float) -> None:
+    """Refuse periods that do not belong to a model: states a period apart must move alike."""
+    if not needs_check(model, "periods"):
+        return
+    periods = cast(Periods, model.periods)
+    places, p = _circular(periods)
+    before = model.step(x, t, dt)
+    for place, period in zip(places, p, strict=True):
+        turned = x.copy()
+        turned[..., place] += period
+        after = model.step(turned, t, dt)
+        change = np.abs(wrap_differences(after - before, periods))
+        if (change > _SAME * (1 + np.abs(before))).any():
+            raise ValueError(
+                f"periods must fit transition, got a period of {period:g} for component "
+                f"{name_component(model, place)}, after which the states move differently"
+            )
+    mark_checked(model, "periods")
+
+
+def check_sensor(
+    sensor: Sensor, model: Model, states: Array, previous: Array | None = None
+) -> None:
+    """Refuse a sensor whose observation of a circular component lacks a period, once.
+
+    Parameters
+    ----------
+    sensor, model
+        The model has circular components.
+    states, previous : ndarray, (..., N, d)
+    """
+    key = f"periods of model {id(model)}"
+    if not needs_check(sensor, key):
+        return
+    mark_checked(sensor, key)
+    x = states.mean(axis=-2)
+    args = () if previous is None else (previous.mean(axis=-2),)
+    before = sensor.predict(x, *args)
+    places, p = _circular(cast(Periods, model.periods))
+    for place, period in zip(places, p, strict=True):
+        turned = x.copy()
+        turned[..., place] += period
+        change = np.abs(sensor.residual(sensor.predict(turned, *args), before))
+        # NaN, where the sensor cannot see, is no change.
+        if (change > _SAME * (1 + np.abs(before))).any():
+            raise ValueError(
+                f"sensors must have periods= where they measure circular components, got one "
+                f"of kind {sensor.kind!r} that changes by {np.nanmax(change):.4g} when component "
+                f"{name_component(model, place)} turns once"
+            )
+
+
+def name_component(model: Model, place: int) -> str:
+    """Return a component's name, or its number."""
+    return model.names[place] if model.names else str(place)
+
+
+def warn_of_wrapping(
+    model: Model, x: Array, values: Array, t: float, dt: float
+) -> None:
+    """Warn once if a model without periods wraps a component that its members straddle.
+
+    `x` and `values` (..., N, d) are members before and after the forecast.
+    """
+    # A cheap test first: some members jump by more than half a turn relative to the first.
+    jumps = values - values[..., :1, :]
+    if not (np.abs(jumps) > np.pi).any() or not needs_check(model, "wrapping"):
+        return
+    is_narrow = np.ptp(x, axis=-2) < 0.5 * np.pi
+    turns = np.round(jumps / (2 * np.pi))
+    is_near_turn = (np.abs(jumps - 2 * np.pi * turns) < 0.5 * np.pi).all(axis=-2)
+    is_torn = (turns != 0).any(axis=-2) & (np.abs(turns) <= 1).all(axis=-2)
+    suspects = np.argwhere(is_narrow & is_near_turn & is_torn)
+    if not len(suspects):
+        return
+    *row, place = suspects[0].tolist()
+    # The proof: the function itself does not tell x from x + 2π.
+    state = x[tuple(row)][:1]
+    turned = state.copy()
+    turned[:, place] += 2 * np.pi
+    change = np.abs(model.step(turned, t, dt) - model.step(state, t, dt))
+    if (change > 1e-6).any():
+        return
+    mark_checked(model, "wrapping")
+    period = "2π"
+    warnings.warn(
+        f"transition wraps component {name_component(model, place)}, and the belief lies on "
+        f"both sides of the cut at t = {t + dt:g} s, where its mean is wrong: declare the "
+        f"circular component, Model(..., periods={{{place}: {period}}})",
+        RuntimeWarning,
+        4,
+    )
+
+
+def warn_of_wrapped_truth(f: Any, mean: Array, truth: Array) -> None:
+    """Warn once if estimates run on where the truth wraps, or the other way round.
+
+    Parameters
+    ----------
+    f : Filter
+        Its model declares no periods, but its sensors wrap.
+    mean : ndarray, (T, *runs, A, d)
+    truth : ndarray, (T, *runs, 1 or A, d)
+    """
+    if not getattr(f, "notices_wrapping", False) or len(mean) < 2:
+        return
+    with np.errstate(invalid="ignore"):
+        error = mean - truth
+        jumps = np.diff(error, axis=0)
+        # A jump by a whole turn between two times, with small errors (mod 2π) at both.
+        is_turn = np.abs(np.abs(jumps) - 2 * np.pi) < 0.2
+        remainder = np.abs(error - 2 * np.pi * np.round(error / (2 * np.pi)))
+        # Wild errors of another kind are not near whole turns all the time.
+        is_close = (remainder < 0.5).mean(axis=0) >= 0.9
+    found = np.argwhere(is_turn & is_close)
+    if not len(found) or not needs_check(f.model, "truth"):
+        return
+    mark_checked(f.model, "truth")
+    place = int(found[0][-1])
+    warnings.warn(
+        f"truth and estimates of component {name_component(f.model, place)} differ by whole "
+        "turns: one of them wraps and the other runs on; declare the circular component, "
+        f"Model(..., periods={{{place}: 2π}})",
+        RuntimeWarning,
+        4,
+    )

@@ -1,0 +1,226 @@
+"""Sensors that are a likelihood p(y | x) of any form: counts, heavy tails, noise that varies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from typing import Annotated
+
+import numpy as np
+
+from ..linalg import broadcast_leading
+from ..validation import (
+    ALLOW_NAN,
+    Array,
+    PositiveInt,
+    Rng,
+    all_finite,
+    call_user,
+    check_array,
+    validated,
+)
+from ..validation.first_use import is_first_use
+from .base import Sensor
+
+__all__ = ["LikelihoodSensor"]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class LikelihoodSensor(Sensor):
+    """A sensor whose observation has any density p(y | x), for filters of weighted members.
+
+    :class:`~distfilt.filters.ParticleFilter` and :class:`~distfilt.filters.TransportFilter` weigh
+    their members by it, with their threshold, jitter, rejuvenation and lag. The other families take
+    the noise as Gaussian and refuse it.
+
+    Parameters
+    ----------
+    dim : int
+        Size m of an observation.
+    log_likelihood : callable
+        ``log_likelihood(x, y) -> log p(y | x)``, on states (..., d) and observations (..., m) with
+        the same leading axes, to (...); minus infinity where y is impossible. It gets copies. A
+        missing component of an observation is NaN; one that is missing altogether is not asked
+        for. With all its factors, if the evidence is recorded.
+    moments : callable, optional
+        ``moments(x) -> (means, covariances)`` of the observation given the state, (..., m) and
+        (..., m, m). A gate and the normalised innovation squared need it.
+    sample : callable, optional
+        ``sample(x, rng=rng) -> y``, (..., m): draws, for :meth:`observe`.
+    kind : str
+        A name, for tables and messages.
+
+    Examples
+    --------
+    A counter, whose counts have a Poisson distribution with a rate of exp(x):
+
+    >>> from scipy.special import gammaln
+    >>> def log_poisson(x, y):
+    ...     return (y * x - np.exp(x) - gammaln(y + 1))[..., 0]
+    >>> def poisson_moments(x):
+    ...     return np.exp(x), np.exp(x)[..., None]
+    >>> counter = LikelihoodSensor(
+    ...     1,
+    ...     log_poisson,
+    ...     moments=poisson_moments,
+    ...     sample=lambda x, rng: rng.poisson(np.exp(x)),
+    ... )
+    >>> counter.observe([2.0], rng=np.random.default_rng(0))
+    array([3.])
+
+    A particle filter with a gate refuses a count that no particle expects:
+
+    >>> from distfilt.filters import ParticleFilter
+    >>> from distfilt.models import Model
+    >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: 0.1 * dt * np.eye(1))
+    >>> f = ParticleFilter(walk, [counter], gate_probability=0.999)
+    >>> start = f.start(([1.0], [[0.2]]), rng=np.random.default_rng(0))
+    >>> run = f.run(start, [1.0, 2.0, 3.0], [[[4.0], [90.0], [5.0]]])
+    >>> run["mean"].values[:, 0, 0].round(1), run["rejected"].values[:, 0]
+    (array([1.2, 1.1, 1.4]), array([0., 1., 0.]))
+
+    Student's t in place of Gaussian noise, so that an outlier counts little, and noise that grows
+    with the distance:
+
+    >>> def log_student(x, y, scale=0.1, nu=3):
+    ...     return -(nu + 1) / 2 * np.log1p((y - x)[..., 0] ** 2 / (nu * scale**2))
+    >>> student = LikelihoodSensor(1, log_student)
+    >>> def log_radar(x, y):
+    ...     std = 0.1 + 0.05 * np.abs(x)
+    ...     return (-(((y - x) / std) ** 2) / 2 - np.log(std))[..., 0]
+    >>> radar = LikelihoodSensor(1, log_radar)
+    >>> radar.evaluate([[1.0], [5.0]], [1.5]).round(2)
+    array([ -3.66, -48.95])
+    """
+
+    log_likelihood: Callable[[Array, Array], Array] = field(kw_only=True)
+    moments: Callable[[Array], tuple[Array, Array]] | None = field(
+        default=None, kw_only=True
+    )
+    sample: Callable[..., Array] | None = field(default=None, kw_only=True)
+
+    def __init__(
+        self,
+        dim: PositiveInt,
+        log_likelihood: Callable[[Array, Array], Array],
+        *,
+        moments: Callable[[Array], tuple[Array, Array]] | None = None,
+        sample: Callable[..., Array] | None = None,
+        kind: str = "likelihood",
+    ) -> None:
+        is_size = isinstance(dim, int) and dim > 0
+        vars(self).update(
+            dim=dim,
+            log_likelihood=log_likelihood,
+            moments=moments,
+            sample=sample,
+            kind=kind,
+            # The parts of a Gaussian sensor; no filter that accepts this one asks for them.
+            h=_refuse_to_predict,
+            noise_cov=np.eye(dim if is_size else 1),
+            residual_function=None,
+            uses_previous=False,
+            linear=None,
+            derivative=None,
+        )
+        for item in fields(self):
+            if item.name not in vars(self):
+                vars(self)[item.name] = item.default
+        self.__post_init__()
+
+    @validated
+    def predict(
+        self,
+        x: Annotated[Array, "... d"],
+        previous: Annotated[Array, "... d"] | None = None,
+    ) -> Array:
+        """Return the mean observation of states (..., d), as (..., m), by `moments`."""
+        return self.predict_moments(x)[0]
+
+    @validated
+    def predict_moments(self, x: Annotated[Array, "... d"]) -> tuple[Array, Array]:
+        """Return mean (..., m) and covariance (..., m, m) of the observation of states (..., d)."""
+        if self.moments is None:
+            raise ValueError(
+                f"moments must be a function for a gate, for nis or for a prediction by a sensor "
+                f"of kind {self.kind!r}, got None"
+            )
+        mean, cov = call_user(self.moments, x.copy())
+        shape = (*x.shape[:-1], self.dim)
+        mean = check_array(mean, "moments", shape)
+        return mean, check_array(cov, "moments", (*shape, self.dim))
+
+    @validated
+    def observe(
+        self,
+        x: Annotated[Array, "... d"],
+        *,
+        rng: Rng,
+        previous: Annotated[Array, "... d"] | None = None,
+    ) -> Array:
+        """Draw an observation of each of the states (..., d), as (..., m), by `sample`."""
+        if self.sample is None:
+            raise ValueError(
+                f"sample must be a function to draw from a sensor of kind {self.kind!r}, got None"
+            )
+        drawn = call_user(self.sample, x.copy(), rng=rng)
+        drawn = check_array(drawn, "sample", (*x.shape[:-1], self.dim))
+        return np.asarray(drawn, dtype=np.float64)
+
+    @validated
+    def evaluate(
+        self,
+        x: Annotated[Array, "... d"],
+        observed: Annotated[Array, "... self.dim", ALLOW_NAN],
+    ) -> Array:
+        """Return log p(y | x) of states (..., d) and observations (..., m), as (...).
+
+        Zero where all components of an observation are missing.
+        """
+        lead = broadcast_leading(x.shape[:-1], observed.shape[:-1], "observed")
+        x = np.broadcast_to(x, (*lead, x.shape[-1]))
+        observed = np.broadcast_to(observed, (*lead, self.dim))
+        is_missing = np.isnan(observed).all(axis=-1)
+        if is_missing.all():
+            return np.zeros(lead)
+        if is_missing.any():
+            # Any observation stands in where there is none; its value is not used.
+            observed = np.where(
+                is_missing[..., None], observed[~is_missing][0], observed
+            )
+        logs = np.asarray(
+            call_user(self.log_likelihood, x.copy(), observed.copy()), dtype=np.float64
+        )
+        self._check_logs(logs, x, observed)
+        return np.where(is_missing, 0.0, logs)
+
+    def _check_logs(self, logs: Array, x: Array, observed: Array) -> None:
+        """Refuse log-likelihoods of a wrong shape, or that are no numbers."""
+        lead = x.shape[:-1]
+        if logs.shape != lead:
+            raise ValueError(
+                f"log_likelihood must return shape {lead} for states {x.shape} and observations "
+                f"{observed.shape}, got {logs.shape}"
+            )
+        if not all_finite(logs) and (np.isnan(logs) | (logs == np.inf)).any():
+            raise ValueError(
+                "log_likelihood must return numbers or minus infinity (impossible), got NaN or "
+                "infinity"
+            )
+        # A function for one state may return the right shape with wrong numbers.
+        if lead and logs.size and is_first_use(self, "log_likelihood"):
+            last = call_user(
+                self.log_likelihood,
+                x.reshape(-1, x.shape[-1])[-1].copy(),
+                observed.reshape(-1, self.dim)[-1].copy(),
+            )
+            if not np.allclose(last, logs.ravel()[-1], rtol=1e-6, atol=1e-9):
+                raise ValueError(
+                    "log_likelihood must take many states at once, (..., d), components last "
+                    "(x[..., 0], not x[0] or x[:, 0]), got one for other axes"
+                )
+
+
+def _refuse_to_predict(x: Array) -> Array:
+    """Stand in for the observation function that a likelihood does not have."""
+    raise ValueError("sensor must have Gaussian noise here, got a LikelihoodSensor")

@@ -1,0 +1,60 @@
+"""Times of a clock where seconds since the start are meant."""
+
+from __future__ import annotations
+
+import warnings
+from datetime import UTC, datetime
+
+import numpy as np
+
+from .checks import Array, format_number
+
+__all__ = ["warn_of_clock"]
+
+_LONG = 1e8
+"""A first step of more than three years, in s."""
+
+_LONG_STEPS = 1e5
+"""A first step that is longer than the others by more than this factor."""
+
+
+def warn_of_clock(start: float, times: Array, name: str) -> None:
+    """Warn if a start at 0 is followed by times of a clock, before a step of that length is made.
+
+    Parameters
+    ----------
+    start : float
+        The time of the prior.
+    times : ndarray, (T,)
+        The times that follow.
+    name : str
+        The argument's name.
+
+    Examples
+    --------
+    >>> with warnings.catch_warnings(action="error"):
+    ...     warn_of_clock(0.0, np.array([1.7e9]), "times")
+    Traceback (most recent call last):
+    RuntimeWarning: times must count from the time 0 of the start, got 1700000000 ...
+    >>> warn_of_clock(1.7e9, np.array([1.7e9 + 1]), "times")
+    """
+    if start != 0 or not times.size:
+        return
+    first = float(times[0])
+    is_long = first > _LONG
+    if times.size > 2 and not is_long:
+        # Seconds of a week, or of a day, are short, but not beside the other steps.
+        is_long = first > _LONG_STEPS * float(np.median(np.diff(times)))
+    if not is_long:
+        return
+    date = ""
+    if _LONG < first < 1e10:
+        day = datetime.fromtimestamp(first, UTC).date()
+        date = f" ({day} if it is a Unix time)"
+    warnings.warn(
+        f"{name} must count from the time 0 of the start, got {format_number(first)} first"
+        f"{date}: the first step would last so long that the prior is lost; give the start "
+        "its time, t=...",
+        RuntimeWarning,
+        stacklevel=4,
+    )

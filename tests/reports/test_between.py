@@ -1,0 +1,171 @@
+"""Delayed observations of times that were never stepped to, as a stream brings them.
+
+| Project | Report | Here |
+|---|---|---|
+| own | a camera frame that arrives late, with a time stamp between two IMU steps | all families |
+
+The right value is that of the filter that gets the same observations in the order of their times,
+and steps to each of them.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from distfilt import filters
+from distfilt.filters import Observation
+from distfilt.models import Model, constant_velocity
+from distfilt.network import covariance_intersection, graphs
+from distfilt.sensors import component
+
+MOTION = constant_velocity(sigma=0.5, axes=1)
+EYE = component([0], std=0.4)
+PRIOR = (np.array([0.0, 1.0]), np.array([[1.0, 0.2], [0.2, 0.5]]))
+TIMES = [1.0, 2.0, 3.0]
+SEEN = [[0.8], [2.3], [2.9]]
+LATE = [
+    Observation(1.3, 0, [1.1], arrival_time=3.0),
+    Observation(0.4, 0, [0.6], arrival_time=2.0),
+    Observation(2.7, 0, [2.9], arrival_time=3.0),
+    Observation(0.4, 0, [0.5], arrival_time=3.0),
+]
+
+
+def in_order(make: Any, prior: Any = PRIOR, model: Model = MOTION, **start: Any) -> Any:
+    """Return the last state of a filter that gets all observations at their own times."""
+    f = make(model, [EYE])
+    events = [Observation(t, 0, y) for t, y in zip(TIMES, SEEN, strict=True)]
+    events += [Observation(late.t, 0, late.value) for late in LATE]
+    return f.final_state(f.run(f.start(prior, **start), None, events))
+
+
+@pytest.mark.parametrize("lag", [5, 6, 9])
+@pytest.mark.parametrize("linearization", ["extended", "unscented"])
+def test_gaussian_filters_are_exact(lag: int, linearization: Any) -> None:
+    """Late by one step or two, within the step that is taken, and twice at the same time."""
+    make = partial(filters.GaussianFilter, linearization=linearization)
+    f = make(MOTION, [EYE], lag=lag)
+    run = f.run(f.start(PRIOR), TIMES, [SEEN], delayed=LATE)
+    state = f.final_state(run)
+    expected = in_order(make)
+    assert np.allclose(state.means, expected.means, atol=1e-12)
+    assert np.allclose(state.covariances, expected.covariances, atol=1e-12)
+    assert len(state.times) <= lag and list(state.times) == sorted(state.times)
+    assert run["time"].values.tolist() == TIMES
+
+
+@pytest.mark.parametrize("runs", [(), (3,)])
+def test_each_time_between_is_kept_as_the_others_are(runs: tuple[int, ...]) -> None:
+    """The belief about the inserted time is that of a smoother which stepped there."""
+    f = filters.GaussianFilter(MOTION, [EYE], lag=6)
+    start = f.start(PRIOR, runs=runs)
+    state = f.step(f.step(start, 1.0, [[0.8]]), 2.0, [[2.3]])
+    state = f.step(state, 2.0, [None], delayed=[Observation(1.3, 0, [1.1])])
+    stepped = f.step(f.step(start, 1.0, [[0.8]]), 1.3, [[1.1]])
+    stepped = f.step(stepped, 2.0, [[2.3]])
+    assert state.times == stepped.times == (0.0, 1.0, 1.3)
+    assert np.allclose(state.joint_means, stepped.joint_means, atol=1e-12)
+    assert np.allclose(state.joint_covariances, stepped.joint_covariances, atol=1e-12)
+
+
+MEMBERS = {
+    "ensemble": partial(filters.EnsembleFilter.exact, members=4000),
+    "particle": partial(filters.ParticleFilter, members=40_000, ess_threshold=0.9),
+    "transport": partial(filters.TransportFilter, members=250),
+}
+
+
+@pytest.mark.filterwarnings("ignore::distfilt.filters.ParticleCollapse")
+@pytest.mark.parametrize("family", MEMBERS)
+def test_members_tend_to_it(family: str) -> None:
+    f = MEMBERS[family](MOTION, [EYE], lag=6)
+    start = f.start(PRIOR, rng=np.random.default_rng(0))
+    run = f.run(start, TIMES, [SEEN], delayed=LATE)
+    expected = in_order(filters.GaussianFilter)
+    slack = 5.0 if family == "transport" else 1.0
+    std = np.sqrt(np.diagonal(expected.covariances[0]))
+    error = run["mean"].values[-1, 0] - expected.means[0]
+    assert (np.abs(error) < 0.06 * slack * std).all()
+    ratio = np.sqrt(run["variance"].values[-1, 0]) / std
+    assert (np.abs(ratio - 1) < 0.06 * slack).all()
+
+
+def test_members_without_noise_are_exact() -> None:
+    """A state between two is then known from either, and so are all moments."""
+    still = constant_velocity(sigma=0.0, axes=1)
+    f = filters.EnsembleFilter.exact(still, [EYE], members=60, lag=6)
+    x = np.random.default_rng(0).standard_normal((60, 2))
+    start = f.start(x, rng=np.random.default_rng(1))
+    run = f.run(start, TIMES, [SEEN], delayed=LATE)
+    g = filters.GaussianFilter
+    expected = in_order(g, (x.mean(axis=0), np.cov(x.T)), still)
+    assert np.allclose(run["mean"].values[-1], expected.means, atol=1e-9)
+    variance = np.diagonal(expected.covariances, axis1=1, axis2=2)
+    assert np.allclose(run["variance"].values[-1], variance, atol=1e-9)
+
+
+def test_agents_of_a_transport_filter_keep_their_members_in_common() -> None:
+    f = filters.TransportFilter(MOTION, [EYE, None], graphs.path(2), members=20, lag=4)
+    state = f.start(PRIOR, rng=np.random.default_rng(0))
+    state = f.step(state, 1.0, [[0.8], None])
+    state = f.step(state, 2.0, [None, None], delayed=[Observation(0.4, 0, [0.6])])
+    assert (state.ensembles[0] == state.ensembles[1]).all()
+    assert state.times == (0.0, 0.4, 1.0)
+
+
+def test_a_network_exchanges_once_a_step_and_sends_the_late_one() -> None:
+    """The neighbour assimilates it too; a time within the step costs no round of its own."""
+    f = filters.GaussianFilter(
+        MOTION, [EYE, None], graphs.path(2), fusion=covariance_intersection, lag=5
+    )
+    state = f.step(f.start(PRIOR), 1.0, [[0.8], None])
+    plain = f.step(state, 2.0, [[2.3], None])
+    late = [Observation(0.4, 0, [0.6]), Observation(1.5, 0, [1.4])]
+    after = f.step(state, 2.0, [[2.3], None], delayed=late)
+    assert after.ledger.rounds == plain.ledger.rounds
+    assert after.ledger.messages.tolist() == plain.ledger.messages.tolist()
+    assert (after.covariances[1] != plain.covariances[1]).any()
+
+
+def test_a_nonlinear_model_is_right_to_first_order() -> None:
+    """A pendulum with small steps: the difference from stepping there is below the bend."""
+    swing = Model(
+        2,
+        lambda x, t, dt: np.stack(
+            [x[..., 0] + dt * x[..., 1], x[..., 1] - dt * np.sin(x[..., 0])], axis=-1
+        ),
+        lambda t, dt: 0.01 * dt * np.eye(2),
+    )
+    f = filters.GaussianFilter(swing, [EYE], lag=4)
+    state = f.step(f.start(PRIOR), 0.1, [[0.1]])
+    late = f.step(state, 0.1, [None], delayed=[Observation(0.05, 0, [0.3])])
+    stepped = f.step(f.step(f.start(PRIOR), 0.05, [[0.3]]), 0.1, [[0.1]])
+    assert np.allclose(late.means, stepped.means, atol=0.01)
+    assert np.allclose(late.covariances, stepped.covariances, atol=0.01)
+
+
+def test_times_outside_are_refused_by_name() -> None:
+    f = filters.GaussianFilter(MOTION, [EYE], lag=1)
+    state = f.step(f.step(f.start(PRIOR), 1.0, [[0.8]]), 2.0, [[2.3]])
+    with pytest.raises(ValueError, match="delayed must be of an earlier time"):
+        f.step(state, 3.0, [None], delayed=[Observation(0.5, 0, [0.0])])
+    none = filters.GaussianFilter(MOTION, [EYE])
+    with pytest.raises(ValueError, match="none with lag = 0"):
+        none.step(none.start(PRIOR), 1.0, [None], delayed=[Observation(0.5, 0, [0.0])])
+    g = filters.GaussianFilter(MOTION, [EYE], lag=2)
+    with pytest.raises(ValueError, match="one of the times for smoothing"):
+        g.smooth(
+            g.start(PRIOR),
+            TIMES,
+            [SEEN],
+            delayed=[Observation(1.5, 0, [0.0], arrival_time=3.0)],
+        )
+    h = filters.GaussianFilter(
+        MOTION, [EYE, None], graphs.path(2), lag=3, exchange_interval=2.0
+    )
+    with pytest.raises(ValueError, match="agents that exchange at intervals"):
+        h.step(h.start(PRIOR), 1.0, [None, None], delayed=[Observation(0.5, 0, [0.0])])

@@ -1,0 +1,169 @@
+"""A known constant, a component of variance zero: the state without it has the same answer.
+
+| Project | Report | Here |
+|---|---|---|
+| own | a calibrated bias kept in the state with variance zero, in an unscented filter | equals the state without it |
+| own | the same in `kalman_filter` and its smoother | equals the state without it |
+| own | agents that share such a constant, by every rule of fusion | equals the state without it |
+
+A bias b that is known to be 0.5 adds to the observation; without it 0.5 is subtracted beforehand.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from distfilt import filters, network
+from distfilt.kalman import kalman_filter, rts_smoother
+from distfilt.models import LinearModel, Model
+from distfilt.network import Channel, graphs
+from distfilt.sensors import Sensor, component
+
+BIAS = 0.5
+PRIOR = (np.array([1.0, -0.5]), np.array([[1.0, 0.3], [0.3, 0.8]]))
+WITH_BIAS = (np.array([1.0, -0.5, BIAS]), np.pad(PRIOR[1], ((0, 1), (0, 1))))
+Q = np.array([[0.3, 0.1], [0.1, 0.2]])
+SEEN = np.array([[1.2], [0.4], [np.nan], [0.9]])
+TIMES = np.arange(1.0, 5.0)
+
+
+def bend(x: np.ndarray, t: float, dt: float) -> np.ndarray:
+    moved = [x[..., 0] + 0.5 * np.sin(x[..., 1]), 0.9 * x[..., 1]]
+    return np.stack([*moved, *np.moveaxis(x[..., 2:], -1, 0)], axis=-1)
+
+
+SHORT = Model(2, bend, lambda t, dt: Q)
+LONG = Model(3, bend, lambda t, dt: np.pad(Q, ((0, 1), (0, 1))))
+SQUARE = Sensor(1, lambda x: x[..., :1] ** 2, [[0.4]])
+BIASED = Sensor(1, lambda x: x[..., :1] ** 2 + x[..., 2:], [[0.4]])
+
+
+@pytest.mark.parametrize("linearization", ["extended", "unscented"])
+@pytest.mark.parametrize("lag", [0, 2])
+def test_gaussian_filters_know_a_constant(linearization: Any, lag: int) -> None:
+    """With κ larger by one in the shorter state, so that d + κ and the points are the same."""
+    make = partial(filters.GaussianFilter, linearization=linearization, lag=lag)
+    long = make(LONG, [BIASED], kappa=1.0)
+    short = make(SHORT, [SQUARE], kappa=2.0)
+    method = "smooth" if lag else "run"
+    a = getattr(long, method)(long.start(WITH_BIAS), TIMES, [SEEN + BIAS])
+    b = getattr(short, method)(short.start(PRIOR), TIMES, [SEEN])
+    assert np.allclose(a["mean"].values[..., :2], b["mean"].values, atol=1e-10)
+    assert np.allclose(
+        a["covariance"].values[..., :2, :2], b["covariance"].values, atol=1e-10
+    )
+    assert (a["mean"].values[..., 2] == BIAS).all()
+    assert (a["variance"].values[..., 2] == 0).all()
+
+
+def test_a_covariance_that_is_not_one_still_ends_the_run() -> None:
+    f = filters.GaussianFilter(SHORT, [SQUARE], linearization="unscented")
+    state = f.start(PRIOR)
+    wrong = state.replace(joint_covariances=np.diag([1.0, -1.0])[None])
+    with pytest.raises(filters.FilterError, match="positive semidefinite"):
+        f.step(wrong, 1.0, [[1.0]])
+
+
+def test_kalman_filter_and_smoother_know_a_constant() -> None:
+    f = np.array([[1.0, 0.5], [-0.2, 0.9]])
+    long_f = np.pad(f, ((0, 1), (0, 1)))
+    long_f[2, 2] = 1.0
+    noise = {"R": [[0.4]]}
+    long = kalman_filter(
+        *WITH_BIAS,
+        SEEN + BIAS,
+        F=long_f,
+        Q=np.pad(Q, ((0, 1), (0, 1))),
+        H=[[1.0, 0.0, 1.0]],
+        **noise,
+    )
+    short = kalman_filter(*PRIOR, SEEN, F=f, Q=Q, H=[[1.0, 0.0]], **noise)
+    smooth_long = rts_smoother(long, F=long_f, Q=np.pad(Q, ((0, 1), (0, 1))))
+    smooth_short = rts_smoother(short, F=f, Q=Q)
+    for a, b in ((long, short), (smooth_long, smooth_short)):
+        assert np.allclose(a.means[..., :2], b.means, atol=1e-12)
+        assert np.allclose(a.covariances[..., :2, :2], b.covariances, atol=1e-12)
+        assert np.allclose(a.means[..., 2], BIAS) and not a.covariances[..., 2, 2].any()
+    assert np.allclose(long.log_likelihood, short.log_likelihood)
+
+
+RULES = {
+    "equal": network.covariance_intersection,
+    **{
+        rule: partial(network.covariance_intersection, rule=rule)
+        for rule in ("trace", "determinant", "min_trace", "min_determinant")
+    },
+    "naive": partial(network.naive_fusion, rounds=2),
+    "average": network.arithmetic_average,
+    "pull": partial(network.consensus_pull, gain=0.1),
+}
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_rules_of_fusion_know_a_constant(name: str) -> None:
+    rng = np.random.default_rng(0)
+    roots = rng.standard_normal((4, 2, 2))
+    covs = roots @ roots.mT + 0.1 * np.eye(2)
+    means = rng.standard_normal((4, 2))
+    long_covs = np.zeros((4, 3, 3))
+    # The constant is the middle component.
+    long_covs[np.ix_(range(4), [0, 2], [0, 2])] = covs
+    long_means = np.insert(means, 1, BIAS, axis=1)
+    a = RULES[name]((long_means, long_covs), Channel(graphs.ring(4)))
+    b = RULES[name]((means, covs), Channel(graphs.ring(4)))
+    assert np.allclose(a[0][:, [0, 2]], b[0], atol=1e-12)
+    assert np.allclose(a[1][np.ix_(range(4), [0, 2], [0, 2])], b[1], atol=1e-12)
+    assert (a[0][:, 1] == BIAS).all() and not a[1][:, 1].any()
+
+
+@pytest.mark.parametrize("name", [name for name in RULES if name != "pull"])
+def test_constants_that_agents_know_differently_are_refused(name: str) -> None:
+    covs = np.array([np.diag([1.0, 0.0])] * 2)
+    means = np.array([[0.0, 1.0], [0.0, 2.0]])
+    with pytest.raises(ValueError, match="equal means where no agent has a variance"):
+        RULES[name]((means, covs), Channel(graphs.path(2)))
+    # One agent knows it, the other does not.
+    mixed = np.array([np.diag([1.0, 0.0]), np.eye(2)])
+    with pytest.raises(ValueError, match="must be a positive definite matrix"):
+        RULES[name]((0 * means, mixed), Channel(graphs.path(2)))
+
+
+@pytest.mark.parametrize("linearization", ["extended", "unscented"])
+def test_networks_of_filters_fuse_beside_a_constant(linearization: Any) -> None:
+    move = LinearModel.from_transition(
+        2, lambda dt: np.eye(2), lambda t, dt: np.diag([0.1, 0.0])
+    )
+    short = LinearModel.from_transition(
+        1, lambda dt: np.eye(1), lambda t, dt: np.array([[0.1]])
+    )
+    options = {
+        "fusion": network.covariance_intersection,
+        "share_observations": False,
+        "linearization": linearization,
+        "lag": 1,
+    }
+    eyes = [component([0], std=0.5), component([0], std=0.8)]
+    f = filters.GaussianFilter(move, eyes, graphs.path(2), **options)
+    g = filters.GaussianFilter(short, eyes, graphs.path(2), **options)
+    seen = [[[1.0], [0.5]], [[0.2], [0.1]]]
+    a = f.run(f.start(([0.0, 3.0], np.diag([1.0, 0.0]))), [1.0, 2.0], seen)
+    b = g.run(g.start(([0.0], [[1.0]])), [1.0, 2.0], seen)
+    assert np.allclose(a["mean"].values[..., 0], b["mean"].values[..., 0], atol=1e-12)
+    assert np.allclose(a["mean"].values[..., 1], 3.0)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        filters.MixtureFilter,
+        partial(filters.InformationIncrementFilter, graph=graphs.complete(1)),
+    ],
+)
+def test_mixtures_refuse_it_by_name(make: Any) -> None:
+    f = make(LONG, [BIASED], target_dim=2)
+    with pytest.raises(ValueError, match="prior must be a positive definite matrix"):
+        f.start(WITH_BIAS)

@@ -1,0 +1,241 @@
+"""Sensors that are a likelihood: counts, Student's t, noise that depends on the state.
+
+| Project | Report | Here |
+|---|---|---|
+| own | counts of a Poisson process in a particle filter | posterior of a grid |
+| own | Student's t for outliers, with the filter's threshold, jitter and lag | posterior of a grid |
+| own | noise that grows with the distance | posterior of a grid |
+| own | a count beside a Gaussian sensor, sent to a neighbour | weights by hand |
+| own | such a sensor in a Kalman filter | refused by name |
+
+Posteriors are integrals on a fine grid; weights are products of densities of scipy.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import norm, poisson, t
+
+from distfilt import filters
+from distfilt.filters import Observation, ParticleFilter, TransportFilter
+from distfilt.models import LinearModel
+from distfilt.network import graphs
+from distfilt.sensors import LikelihoodSensor, component, stack
+
+STILL = LinearModel.from_transition(
+    1, lambda dt: np.eye(1), lambda t, dt: np.zeros((1, 1))
+)
+GRID = np.linspace(-8, 8, 4001)
+
+
+def log_count(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return poisson.logpmf(y[..., 0], np.exp(x[..., 0]))
+
+
+def count_moments(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.exp(x), np.exp(x)[..., None]
+
+
+def log_student(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return t.logpdf((y - x)[..., 0], df=3, scale=0.3)
+
+
+def log_radar(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return norm.logpdf((y - x)[..., 0], scale=0.2 + 0.3 * np.abs(x[..., 0]))
+
+
+COUNTER = LikelihoodSensor(
+    1,
+    log_count,
+    moments=count_moments,
+    sample=lambda x, rng: rng.poisson(np.exp(x)),
+    kind="counter",
+)
+STUDENT = LikelihoodSensor(1, log_student)
+RADAR = LikelihoodSensor(1, log_radar)
+CASES = {
+    "counts": (COUNTER, log_count, [4.0, 6.0, 3.0]),
+    "student": (STUDENT, log_student, [1.0, 9.0, 1.2]),
+    "radar": (RADAR, log_radar, [1.5, 1.0, 1.8]),
+}
+
+
+def grid_moments(log_density: Any, seen: list[float]) -> tuple[float, float]:
+    """Return mean and variance of the posterior with the prior N(1, 1), by a sum on a grid."""
+    logs = norm.logpdf(GRID, 1.0, 1.0)
+    for y in seen:
+        logs = logs + log_density(GRID[:, None], np.full((GRID.size, 1), y))
+    w = np.exp(logs - logs.max())
+    w /= w.sum()
+    mean = float(w @ GRID)
+    return mean, float(w @ (GRID - mean) ** 2)
+
+
+FAMILIES = {
+    "particle": partial(ParticleFilter, members=20_000),
+    "particle, jitter": partial(
+        ParticleFilter, members=20_000, jitter=0.05, ess_threshold=0.9
+    ),
+    "transport": partial(TransportFilter, members=300),
+}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("case", CASES)
+def test_the_posterior_is_that_of_a_grid(family: str, case: str) -> None:
+    sensor, log_density, seen = CASES[case]
+    f = FAMILIES[family](STILL, [sensor])
+    start = f.start(([1.0], [[1.0]]), rng=np.random.default_rng(0))
+    run = f.run(start, [1.0, 2.0, 3.0], [np.array(seen)[:, None]])
+    mean, variance = grid_moments(log_density, seen)
+    slack = 1.0 if family.startswith("particle") else 3.0
+    assert abs(run["mean"].values[-1, 0, 0] - mean) < 0.03 * slack
+    assert abs(run["variance"].values[-1, 0, 0] / variance - 1) < 0.1 * slack
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_late_count_is_that_of_its_own_time(family: str) -> None:
+    """Of a state that doubles, a count of the first time that comes at the second."""
+    double = LinearModel.from_transition(
+        1, lambda dt: 2 * np.eye(1), lambda t, dt: np.zeros((1, 1))
+    )
+    f = FAMILIES[family](double, [COUNTER], lag=1)
+    state = f.start(([1.0], [[1.0]]), rng=np.random.default_rng(0), t=0.0)
+    state = f.step(state, 1.0, [None])
+    late = Observation(0.0, 0, [6.0])
+    after = f.summarize(f.step(state, 1.0, [None], delayed=[late]))
+    mean, variance = grid_moments(log_count, [6.0])
+    assert abs(after.mean[0, 0] - 2 * mean) < 0.15
+    assert abs(after.variance[0, 0] / (4 * variance) - 1) < 0.3
+
+
+def test_weights_are_products_of_densities() -> None:
+    """A Gaussian sensor and two counts of one agent, and the neighbour that receives them."""
+    x = np.linspace(-1, 3, 9)[:, None]
+    position = component([0], std=0.5)
+    f = ParticleFilter(
+        STILL,
+        [[position, COUNTER], None],
+        graphs.path(2),
+        members=9,
+        record_evidence=True,
+    )
+    observed = [
+        [
+            Observation(0.0, 0, [0.8]),
+            Observation(0.0, 0, [3.0], 1),
+            Observation(0.0, 0, [5.0], 1),
+        ],
+        None,
+    ]
+    state = f.step(f.start(x, rng=np.random.default_rng(0)), 0.0, observed)
+    expected = (
+        norm.pdf(0.8, x[:, 0], 0.5)
+        * poisson.pmf(3, np.exp(x[:, 0]))
+        * poisson.pmf(5, np.exp(x[:, 0]))
+    )
+    assert np.allclose(state.weights, expected / expected.sum(), atol=1e-14)
+    assert np.allclose(state.log_likelihood, np.log(expected.mean()), atol=1e-12)
+    assert state.n_observed.tolist() == [3, 3]
+    assert state.ledger.messages.tolist() == [1, 0]
+
+
+def test_the_gate_has_the_spread_of_the_rates_and_of_the_counts() -> None:
+    """Var y = E rate + Var rate, which is the mean of the variances and the variance of means."""
+    x = np.array([[0.0], [1.0], [2.0]])
+    rates = np.exp(x[:, 0])
+    spread = rates.mean() + rates.var()
+    # The chi-squared quantile of 0.95 with one degree is 3.841.
+    limit = rates.mean() + np.sqrt(3.841 * spread)
+    for y, rejected in ((limit - 0.01, 0), (limit + 0.01, 1)):
+        for cls in (ParticleFilter, TransportFilter):
+            f = cls(
+                STILL,
+                [COUNTER.replace(log_likelihood=lambda x, y: 0 * x[..., 0])],
+                members=3,
+                gate_probability=0.95,
+                record_evidence=True,
+            )
+            after = f.step(f.start(x, rng=np.random.default_rng(0)), 0.0, [[y]])
+            assert after.rejected.tolist() == [rejected]
+            nis = 0.0 if rejected else (y - rates.mean()) ** 2 / spread
+            assert np.allclose(after.nis, nis)
+
+
+def test_runs_that_miss_the_count_keep_their_weights() -> None:
+    x = np.linspace(-1, 3, 9)[:, None]
+    f = ParticleFilter(STILL, [COUNTER], members=9)
+    start = f.start(x, rng=np.random.default_rng(0), runs=(2,))
+    state = f.step(start, 0.0, [[[3.0], [np.nan]]])
+    w = poisson.pmf(3, np.exp(x[:, 0]))
+    assert np.allclose(state.weights[0, 0], w / w.sum())
+    assert np.allclose(state.weights[1, 0], 1 / 9)
+
+
+def test_particles_that_make_a_count_impossible_lose_their_weight() -> None:
+    """And a count that all of them make impossible ends the run by name."""
+
+    def log_positive(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.where(x[..., 0] > 0, 0.0, -np.inf)
+
+    f = ParticleFilter(STILL, [LikelihoodSensor(1, log_positive)], members=4)
+    x = np.array([[-1.0], [1.0], [-2.0], [2.0]])
+    state = f.step(f.start(x, rng=np.random.default_rng(0)), 0.0, [[1.0]])
+    assert np.allclose(state.weights, [[0, 0.5, 0, 0.5]])
+    with pytest.raises(filters.FilterError, match="likelihood of zero"):
+        f.step(f.start(-abs(x), rng=np.random.default_rng(0)), 0.0, [[1.0]])
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        filters.GaussianFilter,
+        partial(filters.GaussianFilter, linearization="unscented"),
+        filters.EnsembleFilter,
+        partial(filters.MixtureFilter, target_dim=1),
+        partial(
+            filters.InformationIncrementFilter, target_dim=1, graph=graphs.complete(1)
+        ),
+    ],
+)
+def test_families_of_gaussian_noise_refuse_it_by_name(make: Any) -> None:
+    with pytest.raises(ValueError, match="sensors must have Gaussian noise here"):
+        make(STILL, [COUNTER])
+    # Also where it comes with an observation.
+    f = make(STILL, [component([0], std=1.0)])
+    start = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
+    with pytest.raises(ValueError, match="sensors must have Gaussian noise here"):
+        f.step(start, 0.0, [[Observation(0.0, 0, [1.0], COUNTER)]])
+
+
+def test_what_it_cannot_do_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="moments for a gate"):
+        ParticleFilter(STILL, [STUDENT], gate_probability=0.9)
+    with pytest.raises(ValueError, match="sensors must have Gaussian noise to be"):
+        stack([COUNTER, COUNTER])
+    with pytest.raises(ValueError, match="moments must be a function"):
+        STUDENT.predict([1.0])
+    with pytest.raises(ValueError, match="sample must be a function"):
+        STUDENT.observe([1.0], rng=np.random.default_rng(0))
+    columns = LikelihoodSensor(1, lambda x, y: y - x)
+    with pytest.raises(ValueError, match=r"log_likelihood must return shape \(2,\)"):
+        columns.evaluate([[1.0], [2.0]], [1.0])
+    lost = LikelihoodSensor(1, lambda x, y: np.sqrt(-1 - x[..., 0] ** 2))
+    with (
+        np.errstate(invalid="ignore"),
+        pytest.raises(ValueError, match="log_likelihood must return numbers"),
+    ):
+        lost.evaluate([[1.0], [2.0]], [1.0])
+    mixed = LikelihoodSensor(1, lambda x, y: (x - x.mean(axis=0))[..., 0])
+    with pytest.raises(ValueError, match="log_likelihood must take many states"):
+        mixed.evaluate([[1.0], [2.0]], [1.0])
+
+
+def test_draws_and_predictions_are_its_own() -> None:
+    drawn = COUNTER.observe(np.full((20_000, 1), 1.0), rng=np.random.default_rng(0))
+    assert abs(drawn.mean() - np.e) < 0.05 and abs(drawn.var() - np.e) < 0.15
+    assert np.allclose(COUNTER.predict([[0.0], [1.0]]), [[1.0], [np.e]])

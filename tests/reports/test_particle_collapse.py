@@ -1,0 +1,141 @@
+"""Collapse of particles under a small process noise: alarm, and jitter by default.
+
+| Report | Situation |
+|---|---|
+| nchopin/particles 32 | a velocity that gets stuck on one value |
+| BasisResearch/dynestyx 185 | particles that collapse and do not move any more |
+| JuliaPOMDP/ParticleFilters.jl 21 | kernels that separate copies |
+| ecosme38/Data-Assimilation-Notebooks 3 | how large the noise after resampling should be |
+| rlabbe/Kalman-and-Bayesian-Filters-in-Python 336 | few particles, resampled rarely |
+| own | a constant parameter beside a state with noise |
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+
+from distfilt.filters import GaussianFilter, ParticleFilter
+from distfilt.filters.particle import ParticleState, measure_families
+from distfilt.models import Model
+from distfilt.sensors import component
+from distfilt.updates.particles import ParticleCollapse
+
+STEPS = 200
+
+
+def wander(variance: float, constant: bool = False) -> Model:
+    """Return a position with a velocity, and noise in both, or not in the velocity."""
+    phi = np.array([[1.0, 0.1], [0.0, 1.0]])
+    q = variance * np.diag([1.0, 0.0 if constant else 1.0])
+    return Model(2, lambda x, t, dt: x @ phi.T, lambda t, dt: q)
+
+
+def track(
+    model: Model, seed: int, **options: Any
+) -> tuple[float, float, int, ParticleState]:
+    """Return the mean NEES of particles and of a Kalman filter, and the number of alarms."""
+    rng = np.random.default_rng(seed)
+    root = np.sqrt(model.Q(0.0, 1.0))
+    x = rng.normal(size=2)
+    sensors = [component([0], std=0.3)]
+    f = ParticleFilter(model, sensors, **options)
+    kalman = GaussianFilter(model, sensors)
+    prior = (np.zeros(2), np.eye(2))
+    state = f.start(prior, rng=np.random.default_rng(seed + 100))
+    exact = kalman.start(prior)
+    nees = np.zeros((STEPS, 2))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for k in range(STEPS):
+            x = model.step(x, 0.0, 1.0) + root @ rng.normal(size=2)
+            y = [[x[0] + 0.3 * rng.normal()]]
+            state = f.step(state, k + 1.0, y)
+            exact = kalman.step(exact, k + 1.0, y)
+            for column, summary in enumerate(
+                (f.summarize(state), kalman.summarize(exact))
+            ):
+                assert summary.covariance is not None
+                error = summary.mean[0] - x
+                solved = np.linalg.solve(summary.covariance[0], error)
+                nees[k, column] = error @ solved / 2
+    alarms = sum(issubclass(w.category, ParticleCollapse) for w in caught)
+    by_particles, by_kalman = nees.mean(axis=0)
+    return float(by_particles), float(by_kalman), alarms, state
+
+
+@pytest.mark.parametrize(("constant", "seed"), [(False, 3), (True, 0)])
+def test_a_collapse_under_small_noise_is_seen(constant: bool, seed: int) -> None:
+    """All particles differ and have weight, yet few ancestors are left."""
+    model = wander(1e-6, constant)
+    nees, exact, alarms, state = track(model, seed, members=2000, jitter=0.0)
+    assert nees > 50 * exact
+    assert alarms > 0
+    distinct = np.unique(state.particles[0, :, 0]).size
+    assert distinct == 2000
+
+
+@pytest.mark.parametrize("constant", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_default_jitter_follows(seed: int, constant: bool) -> None:
+    """It separates copies that the noise cannot: errors as of a Kalman filter, no alarm."""
+    model = wander(1e-6, constant)
+    nees, exact, alarms, _ = track(model, seed, members=2000)
+    assert nees < 1.2 * exact
+    assert alarms == 0
+
+
+def test_jitter_finds_back_from_a_prior_that_hardly_reaches() -> None:
+    """The truth is among a few particles only; the error shrinks by a factor of thousands."""
+    model = wander(1e-6)
+    without, *_ = track(model, 3, members=2000, jitter=0.0)
+    nees, _, alarms, _ = track(model, 3, members=2000)
+    assert nees < 1e-3 * without
+    # What cannot be repaired at once is still said.
+    assert alarms > 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_healthy_filter_is_not_disturbed(seed: int) -> None:
+    """With noise that separates copies: no alarm, and the numbers without jitter."""
+    model = wander(1e-2)
+    by_default = track(model, seed, members=2000)
+    without = track(model, seed, members=2000, jitter=0.0)
+    assert by_default[2] == without[2] == 0
+    assert np.array_equal(by_default[3].particles, without[3].particles)
+    assert by_default[0] < 1.3 * by_default[1]
+
+
+def test_what_families_are_worth() -> None:
+    """Four narrow families of unequal weight, by the variance of a weighted mean."""
+    rng = np.random.default_rng(0)
+    centres = rng.normal(size=(4, 1))
+    x = np.repeat(centres, 25, axis=0)
+    mass = np.array([0.4, 0.3, 0.2, 0.1])
+    weights = np.repeat(mass / 25, 25)
+    ancestors = np.repeat([3, 7, 50, 51], 25)
+    arrays = (x[None], weights[None], ancestors[None], np.array([True]))
+    sizes, shares = measure_families(*arrays)
+    assert sizes[0] == pytest.approx(1 / (mass**2).sum())
+    assert shares[0] == pytest.approx(0.0, abs=1e-12)
+    # Members that are spread like all particles are not worth less for their ancestors.
+    spread = rng.normal(size=(1, 100, 1))
+    sizes, shares = measure_families(spread, *arrays[1:])
+    assert sizes[0] > 20
+    assert shares[0] > 0.8
+
+
+def test_a_state_keeps_its_ancestors(tmp_path: Any) -> None:
+    """Saved and loaded, and continued to the bit."""
+    model = wander(1e-6)
+    *_, state = track(model, 1, members=300)
+    path = tmp_path / "state.npz"
+    state.save(path)
+    loaded = ParticleState.load(path)
+    assert np.array_equal(loaded.ancestors, state.ancestors)
+    f = ParticleFilter(model, [component([0], std=0.3)], members=300)
+    after = [f.step(s, state.t + 1.0, [None]) for s in (state, loaded)]
+    assert np.array_equal(after[0].particles, after[1].particles)

@@ -1,0 +1,158 @@
+"""Draws of an update of one's own: every run has its own, of any distribution.
+
+| Report | Situation |
+|---|---|
+| binarymatt/pyres 82 | jobs that draw the same integers |
+| ray-project/ray 49443 | batches that draw the same numbers |
+| Libensemble/libensemble 542 | a stream for each worker |
+| Bears-R-Us/arkouda 3322 | draws that depend on how the work is divided |
+| cubed-dev/cubed 4 | a stream for each chunk |
+| own | parameters for each run, permutations, results in place |
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from distfilt.filters import EnsembleFilter
+from distfilt.models import Model
+from distfilt.sensors import Sensor
+from distfilt.updates import update, with_missing
+from distfilt.updates.decorator import _EVENTS, _PARAMETERS, RowGenerator
+
+LEAD = (2, 3)
+ROWS = np.array([1, 4, 5])
+ARGUMENTS: dict[str, tuple[Any, ...]] = {
+    "beta": (2.0, 3.0),
+    "binomial": (50, 0.3),
+    "chisquare": (3.0,),
+    "choice": (1000,),
+    "dirichlet": ([1.0, 2.0, 3.0],),
+    "f": (3.0, 9.0),
+    "gamma": (2.0,),
+    "geometric": (0.1,),
+    "hypergeometric": (50, 50, 30),
+    "integers": (10**9,),
+    "logseries": (0.9,),
+    "multinomial": (99, [0.2, 0.8]),
+    "multivariate_hypergeometric": ([50, 60], 30),
+    "multivariate_normal": ([0.0, 1.0], np.eye(2)),
+    "negative_binomial": (9, 0.1),
+    "noncentral_chisquare": (3.0, 1.0),
+    "noncentral_f": (3.0, 9.0, 1.0),
+    "pareto": (3.0,),
+    "poisson": (50.0,),
+    "power": (3.0,),
+    "standard_gamma": (2.0,),
+    "standard_t": (3.0,),
+    "triangular": (0.0, 1.0, 3.0),
+    "vonmises": (0.0, 1.0),
+    "wald": (1.0, 1.0),
+    "weibull": (2.0,),
+    "zipf": (1.5,),
+}
+
+
+def for_rows(seed: int = 1) -> RowGenerator:
+    """Return a generator for some rows of a batch."""
+    return RowGenerator(np.random.PCG64(seed), LEAD, ROWS)
+
+
+@pytest.mark.parametrize("name", [*_PARAMETERS, *_EVENTS])
+def test_rows_of_any_distribution_are_those_of_the_whole_batch(name: str) -> None:
+    """numpy's own draws for all rows, of which some are selected."""
+    arguments = ARGUMENTS.get(name, ())
+    draw = getattr(np.random.default_rng(np.random.PCG64(1)), name)
+    whole = draw(*arguments, size=(*LEAD, 4, 2))
+    whole = whole.reshape(6, *whole.shape[2:])
+    part = getattr(for_rows(), name)(*arguments, size=(3, 4, 2))
+    assert np.array_equal(part, whole[ROWS])
+    # Rows have different draws.
+    assert not np.array_equal(part[0], part[1])
+
+
+def test_every_method_of_numpy_is_covered() -> None:
+    """But for those that do not draw by a size."""
+    names = {name for name in dir(np.random.Generator) if not name.startswith("_")}
+    others = {"bit_generator", "bytes", "permutation", "permuted", "shuffle", "spawn"}
+    assert names - others == {*_PARAMETERS, *_EVENTS}
+
+
+def test_parameters_of_each_row() -> None:
+    """Without a size it is the parameters'; numbers for each row stay with their rows."""
+    x = np.arange(24.0).reshape(3, 4, 2)
+    normal = np.random.default_rng(np.random.PCG64(1)).normal(size=(6, 4, 2))[ROWS]
+    assert np.allclose(for_rows().normal(x, 0.5), x + 0.5 * normal)
+    uniform = np.random.default_rng(np.random.PCG64(1)).random((6, 4, 2))[ROWS]
+    low = x[:, :1]
+    drawn = for_rows().uniform(low, low + 2.0, (3, 4, 2))
+    assert np.allclose(drawn, low + 2.0 * uniform)
+    result = np.empty((3, 2))
+    assert for_rows().standard_normal(out=result, size=(3, 2)) is result
+    counts = for_rows().poisson(np.array([[0.0], [1e3], [1e6]]), (3, 9))
+    assert (counts[0] == 0).all()
+    assert np.allclose(counts[1:].mean(axis=1), [1e3, 1e6], rtol=0.1)
+
+
+def test_permutations_of_each_row() -> None:
+    """Every row is permuted by itself, and in its own way."""
+    x = np.tile(np.arange(50), (3, 1))
+    mixed = for_rows().permuted(x, axis=1)
+    assert (np.sort(mixed, axis=1) == x).all()
+    assert (mixed[0] != mixed[1]).any()
+    assert (mixed[1] != mixed[2]).any()
+
+
+DRAWS = {
+    "laplace": lambda rng, shape: rng.laplace(size=shape),
+    "uniform": lambda rng, shape: rng.uniform(-1.0, 1.0, shape),
+    "integers": lambda rng, shape: rng.integers(1000, size=shape),
+    "normal": lambda rng, shape: rng.normal(size=shape),
+    "exponential": lambda rng, shape: rng.exponential(2.0, shape),
+    "choice": lambda rng, shape: rng.choice([-1.0, 0.5, 2.0], size=shape),
+    "means": lambda rng, shape: rng.laplace(np.zeros(shape), 1.0),
+}
+
+
+@pytest.mark.parametrize("name", DRAWS)
+def test_runs_that_miss_different_components_have_their_own_draws(name: str) -> None:
+    """And a run's draws do not depend on what the others miss."""
+
+    def add_noise(x: Any, h: Any, y: Any, r: Any, *, rng: Any) -> Any:
+        return x + DRAWS[name](rng, x.shape)
+
+    x = np.zeros((3, 30, 1))
+    h = np.zeros((3, 30, 2))
+    y = np.array([[1.0, np.nan], [np.nan, 1.0], [1.0, np.nan]])
+    after = with_missing(add_noise, x, h, y, np.eye(2), rng=np.random.default_rng(0))
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        assert (after[a] != after[b]).any()
+    alike = np.array([[1.0, np.nan]] * 3)
+    other = with_missing(
+        add_noise, x, h, alike, np.eye(2), rng=np.random.default_rng(0)
+    )
+    assert np.array_equal(after, other)
+
+
+@pytest.mark.parametrize("stacks", [False, True])
+@pytest.mark.parametrize("name", DRAWS)
+def test_runs_of_a_filter_have_their_own_draws(name: str, stacks: bool) -> None:
+    """With an update of one's own, decorated or not."""
+
+    def shift(x: Any, h: Any, y: Any, r: Any, *, rng: Any) -> Any:
+        return x + DRAWS[name](rng, x.shape)
+
+    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    sensor = Sensor(2, lambda x: np.concatenate([x, x], axis=-1), np.eye(2))
+    f = EnsembleFilter(
+        still, [sensor], update=update(shift) if stacks else shift, members=20
+    )
+    prior = np.linspace(-1.0, 1.0, 20)[:, None]
+    state = f.start(prior, runs=(3,), rng=np.random.default_rng(0))
+    y = np.array([[1.0, np.nan], [np.nan, 1.0], [1.0, 1.0]])
+    after = f.step(state, 0.0, [y]).ensembles[:, 0] - state.ensembles[:, 0]
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        assert (np.abs(after[a] - after[b]) > 1e-9).any()
