@@ -226,7 +226,8 @@ def kernel_constant(grid: Grid, *, bandwidth: AxisWidths, agents: PositiveInt) -
     r"""The constant k̄ of Zheng and Lin: ∫K²/(N hᵈ), for which Var p_KDE ≈ k̄ p.
 
     For a Gaussian, :math:`\bar k = 1/\bigl(N(2\sqrt\pi h)^d\bigr)`, with the product of the
-    bandwidths if there is one for each axis, (1, d). It gives the variance of each cell. The noise is not white, since neighbouring cells depend on the same agents: see
+    bandwidths if there is one for each axis, (1, d). It gives the variance of each
+    cell. The noise is not white, since neighbouring cells depend on the same agents: see
     :func:`kernel_covariance`.
 
     Examples

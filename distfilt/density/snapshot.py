@@ -17,7 +17,6 @@ from ..validation import (
     DistinctIndices,
     FrozenModel,
     Mask,
-    PositiveFloat,
 )
 from .grid import Grid
 from .kernel import AxisWidths, kernel_constant, kernels

@@ -47,8 +47,8 @@ from .failures import RECOVERABLE, FilterError, is_argument_error
 from .observations import Observation, match_delayed, read_observations
 from .plans import TimesArgument, find_degrees, plan_steps
 from .priors import Prior
-from .repetition import drop_repeated
 from .record import SCORES, Score, Summary, Truth, final_state, record_run
+from .repetition import drop_repeated
 from .resets import Reset, read_reset
 from .states import SensorState, State
 from .step import Step
@@ -333,24 +333,19 @@ class Filter(FrozenModel, ABC, Generic[S]):
             state = moved
             matched = match_delayed(cast(Any, self), delayed, state, t)
         repeated: list[Observation] = []
+        has_sensors = hasattr(self, "agent_sensors")
         # Mostly each agent has one observation, of a new time: then none has come before.
-        has_sensors = isinstance(state, SensorState)
-        may_repeat = bool(matched) or t == state.t
-        if has_sensors and (may_repeat or any(len(entries) > 1 for entries in read)):
+        is_plain = not matched and t > state.t
+        if has_sensors and (not is_plain or any(len(entries) > 1 for entries in read)):
             read, matched, repeated = drop_repeated(
-                read, matched, cast(Any, state).assimilated, cast(Any, self).model.dim
+                read, matched, state.assimilated, cast(Any, self).model.dim
             )
         # From here on all inputs are checked, and the family's own method does the rest.
         step = Step(self, state, t, read, matched, reuse_rng=reuse_rng)
         if repeated:
             step.warn_once("repeated", _describe_repetition(repeated[0]))
-        if is_single and has_sensors:
-            # Angles below four turns need no closer look.
-            observed = [o for entries in (*read, matched) for o in entries]
-            large = [o for o in observed if (abs(o.value) > 25).any()]
-            wild = find_degrees(cast(Any, self), large) if large else None
-            if wild is not None:
-                step.warn_once("degrees", wild)
+        if has_sensors and (is_single or matched):
+            self._warn_of_degrees(step, [*read, matched] if is_single else [matched])
         try:
             return self.next_state(step)
         except RECOVERABLE as error:
@@ -358,6 +353,17 @@ class Filter(FrozenModel, ABC, Generic[S]):
             if is_argument_error(error):
                 raise
             raise FilterError((), None, t, error) from error
+
+    def _warn_of_degrees(
+        self, step: Step[S], observations: Iterable[Sequence[Observation]]
+    ) -> None:
+        """Warn once of angles in degrees, in observations that are not part of a plan."""
+        observed = [o for entries in observations for o in entries]
+        # Angles below four turns need no closer look.
+        large = [o for o in observed if (abs(o.value) > 25).any()]
+        text = find_degrees(self, large) if large else None
+        if text is not None:
+            step.warn_once("degrees", text)
 
     def check_state(self, state: S) -> None:
         """Refuse a state that is not of this filter."""
@@ -459,8 +465,8 @@ class Filter(FrozenModel, ABC, Generic[S]):
             is d on average for a consistent filter. ``messages``, ``scalars``, ``bytes``, ``lost``
             and ``rounds`` are those of each step, the same names with ``_total`` their sums;
             ``unseen`` counts the observations that an agent cannot use, since its sensor cannot
-            see from its belief; ``rejected`` counts those that the gate rejects; with `record_evidence`
-            ``log_likelihood``, ``nis`` and ``n_observed`` score them all.
+            see from its belief; ``rejected`` counts those that the gate rejects; with
+            `record_evidence` ``log_likelihood``, ``nis`` and ``n_observed`` score the others.
             :func:`distfilt.filters.final_state` returns the state at the end.
         """
         return self._record(state, times, observations, truth, scores, delayed, 0)
@@ -689,7 +695,10 @@ class SensorFilter(Filter[S]):
         >>> from distfilt.models import Model
         >>> from distfilt.sensors import component
         >>> still = Model(
-        ...     2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)), names=("robot", "landmark")
+        ...     2,
+        ...     lambda x, t, dt: x,
+        ...     lambda t, dt: np.zeros((2, 2)),
+        ...     names=("robot", "landmark"),
         ... )
         >>> f = GaussianFilter(still, [component([0], std=1.0)])
         >>> state = f.start(([3.0, 0.0], np.diag([4.0, 1e6])))

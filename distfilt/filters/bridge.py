@@ -63,11 +63,11 @@ def bridge_states(
     forecast = model.step(before, start, t - start)
     slope_before = model.jacobian(before, start, t - start, std=std)
     slope_after = model.jacobian(forecast, t, end - t, std=std)
-    first = model.Q(start, t - start)
+    first = model.noise_at(before, start, t - start)
     cross = slope_after @ first
     # The pseudo-inverse has no units if the variances are one.
     scaled, unit = to_unit_variances(
-        symmetrise(cross @ slope_after.mT + model.Q(t, end - t))
+        symmetrise(cross @ slope_after.mT + model.noise_at(forecast, t, end - t))
     )
     inverse = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True)
     inverse = inverse / (unit[..., :, None] * unit[..., None, :])

@@ -1,8 +1,9 @@
 """Sensors of changes: the earlier time with which each of them compares the present state.
 
-A sensor of changes compares the present state with that at its own last observation, whatever other
-sensors have observed in between. A state keeps these times, and the beliefs about those of them that
-its lag does not keep. They are conditioned on all later observations, as the past of a lag is.
+A sensor of changes compares the present state with that at its own last observation, whatever
+other sensors have observed in between. A state keeps these times, and the beliefs about those of
+them that its lag does not keep. They are conditioned on all later observations, as the past of a
+lag is.
 """
 
 from __future__ import annotations
@@ -110,7 +111,11 @@ class References:
         self.sources.setdefault(agent, []).append((source, size))
 
     def find(
-        self, group: Received, past: Sequence[Array], times: Sequence[float], origin: Any
+        self,
+        group: Received,
+        past: Sequence[Array],
+        times: Sequence[float],
+        origin: Any,
     ) -> list[Previous]:
         """Return the earlier members with which a group's present observations are compared.
 

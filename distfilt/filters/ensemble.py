@@ -20,13 +20,12 @@ from ..coupling import rejuvenate, transport_plans
 from ..coupling.transform import apply_plan, normalize_weights
 from ..linalg import center_ensemble, log_sum_exp, to_unit_variances
 from ..models import Model
-from ..periods import check_transition, fold, fold_torn, settle, warn_of_wrapping
 from ..network import Graph, finite_time_consensus, intersect_ensembles
+from ..periods import check_transition, fold, fold_torn, settle, warn_of_wrapping
 from ..sensors import Sensor
 from ..updates import enkf, enkf_exact, stochastic_forecast, with_missing
 from ..updates.decorator import has_tag
 from ..updates.gaussian import exact_forecast
-from ..updates.wrappers import find_locate
 from ..updates.particles import (
     log_likelihood,
     log_normalizer,
@@ -34,6 +33,7 @@ from ..updates.particles import (
     warn_of_collapse,
     warn_of_weights,
 )
+from ..updates.wrappers import find_locate
 from ..validation import (
     Array,
     Bounds,
@@ -325,7 +325,7 @@ class EnsembleFilter(
         branch: Literal["mean", "each"] = "each" if weights_members else "mean"
         predicted = group.predict(members[place], previous, branch=branch)
         if not np.isfinite(predicted).all():
-            is_unseen = np.isnan(predicted).any(axis=-2)
+            is_unseen = np.asarray(np.isnan(predicted).any(axis=-2))
             step.note_unseen(group, is_unseen, "some members cannot see")
         group = step.gate(group, sample_moments, predicted, is_torn=weights_members)
         if weights_members and self.periods:
@@ -529,9 +529,7 @@ class TransportFilter(_EnsembleSummary):
             sample_step = partial(self.model.sample_step, t=state.t, dt=step.dt)
             members = self._draw_in_common(sample_step, (members,), step.rng)
             if self.notices_wrapping:
-                warn_of_wrapping(
-                    self.model, state.ensembles, members, state.t, step.dt
-                )
+                warn_of_wrapping(self.model, state.ensembles, members, state.t, step.dt)
         stack = step.stack(step.check_forecast(members, state.ensembles))
         (logs,) = step.fuse(self._log_likelihoods(stack, step))
         if step.has_fusion:
@@ -580,7 +578,7 @@ class TransportFilter(_EnsembleSummary):
             members = stack[place][..., rows, :, :]
             predicted = group.predict(members, previous, branch="each")
             if not all_finite(predicted):
-                is_unseen = np.isnan(predicted).any(axis=-2)
+                is_unseen = np.asarray(np.isnan(predicted).any(axis=-2))
                 step.note_unseen(group, is_unseen, "some members cannot see")
             weighted = None
             if group.likelihoods:
@@ -675,7 +673,7 @@ def fuse_members(step: Step[Any], members: Array) -> Array:
     means = members.mean(axis=-2)
     shift = (fold(means, periods) - means)[..., None, :]
     (fused,) = step.fuse(members + shift)
-    return fold_torn(fused, periods) - shift
+    return np.asarray(fold_torn(fused, periods) - shift)
 
 
 def regress_past(stack: list[Array], fused: Array) -> list[Array]:

@@ -7,14 +7,13 @@ each of them has. :func:`fuse_beliefs` applies the filter's fusion rule after th
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..network import Channel
 from ..sensors import Sensor
 from ..validation import Array, call_user, check_array, format_number
-from .changes import References
 from .observations import Observation, sensor_of
 
 if TYPE_CHECKING:
@@ -46,8 +45,6 @@ def collect_observations(step: Step[Any]) -> Known:
     if step.state.pending:
         sent_labels = [_label(step, of_agent) for of_agent in sent]
     by_time: Known = {}
-    if step.references is not None:
-        step.references.sources.clear()
     for agent, messages in enumerate(inbox):
         # In order of the senders, so that all agents with the same set have the same order.
         for sender in sorted((agent, *messages)):
@@ -60,8 +57,7 @@ def collect_observations(step: Step[Any]) -> Known:
                 listed = sent[sender]
                 payload = messages[sender]
                 values = list(payload) if type(payload) is tuple else [payload]
-            if step.references is not None:
-                _receive_changes(step, agent, listed)
+            _receive_changes(step, agent, listed)
             # The part behind the values counts as communication alone.
             for (t, sensor), value in zip(times_and_sensors, values, strict=False):
                 if t not in by_time:
@@ -73,8 +69,10 @@ def collect_observations(step: Step[Any]) -> Known:
 def _receive_changes(
     step: Step[Any], agent: int, observations: list[Observation]
 ) -> None:
-    """Note which sensors' present observations an agent has, in their order."""
-    references = cast(References, step.references)
+    """Note which sensors' present observations an agent has, if some measure changes."""
+    references = step.references
+    if references is None:
+        return
     for observation in observations:
         if observation.t == step.t:
             references.receive(agent, observation)
@@ -115,9 +113,7 @@ def _choose_outgoing(
     return [old + new for old, new in zip(outgoing, observed, strict=True)]
 
 
-def _refuse_waiting_changes(
-    step: Step[Any], observed: list[list[Observation]]
-) -> None:
+def _refuse_waiting_changes(step: Step[Any], observed: list[list[Observation]]) -> None:
     """Refuse observations of changes that would wait for the next contact."""
     for of_agent in observed:
         for observation in of_agent:

@@ -254,7 +254,10 @@ class GaussianFilter(
         # P = F P Fᵀ + Q, with a contiguous F.
         slope = np.ascontiguousarray(slope)
         old = state.joint_covariances
-        noise = model.Q(state.t, dt) + extra
+        if model.has_state_noise:
+            noise = model.noise_at(state.means, state.t, dt) + extra
+        else:
+            noise = model.Q(state.t, dt) + extra
         cov = slope @ old[..., :d, :d] @ slope.mT + noise
         size = len(step.times) * d
         if size:
@@ -373,7 +376,9 @@ class GaussianFilter(
             is_unseen |= np.isnan(slope).any(axis=-1)
             predicted = np.where(is_unseen, np.nan, predicted)
         if self.linearization == "extended":
-            reason = "the sensor is at a singular point, where its derivative is zero or NaN"
+            reason = (
+                "the sensor is at a singular point, where its derivative is zero or NaN"
+            )
             is_unseen |= ~slope.any(axis=-1)
         if is_unseen.any():
             for part in group.likelihoods:

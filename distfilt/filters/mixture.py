@@ -84,8 +84,13 @@ class TargetMixtureFilter(
     supports_runs: ClassVar[bool] = False
 
     def check_parts(self) -> None:
-        """Refuse a model that is smaller than the target."""
+        """Refuse a model that is smaller than the target, or whose noise depends on the state."""
         super().check_parts()
+        if self.model.has_state_noise:
+            raise ValueError(
+                "model must have a noise that does not depend on the state here, got a "
+                f"{type(self.model).__name__}"
+            )
         Bounds(at_most=self.model.dim)(self.target_dim, "target_dim")
         Bounds(at_least=self.n_components)(self.max_components, "max_components")
 

@@ -144,7 +144,7 @@ class ParticleFilter(
         state = step.state
         # Whole paths are resampled: the stack holds each particle's earlier states too.
         stack = step.stack(state.particles)
-        log_weights, ancestors = self._resample(stack, state, step)
+        log_weights, ancestors, worth = self._resample(stack, state, step)
         # Where each particle comes from: resampling has moved it from its place in the state.
         origin = stack[-1]
         if step.dt:
@@ -176,7 +176,7 @@ class ParticleFilter(
         after = step.end(
             particles=fused, log_weights=log_weights, past=past, ancestors=ancestors
         )
-        self._warn(after)
+        self._warn(after, worth)
         return after
 
     def summarize(self, state: ParticleState) -> Summary:
@@ -210,7 +210,7 @@ class ParticleFilter(
         predicted = group.predict(members, previous, branch="each")
         if not all_finite(predicted):
             # A particle that cannot see contradicts what was seen, unless none can.
-            is_unseen = np.isnan(predicted).all(axis=-2)
+            is_unseen = np.asarray(np.isnan(predicted).all(axis=-2))
             step.note_unseen(group, is_unseen, "no particle can see")
         # log w' = log w + log p(y | x), normalised; the gate weighs by the old weights.
         old = log_weights[..., rows, :]
@@ -249,10 +249,11 @@ class ParticleFilter(
 
     def _resample(
         self, stack: list[Array], state: ParticleState, step: Step[ParticleState]
-    ) -> tuple[Array, Indices]:
+    ) -> tuple[Array, Indices, float]:
         """Resample agents with a small effective size, in place.
 
-        Returns the log-weights, and each particle's ancestor.
+        Returns the log-weights, each particle's ancestor, and what an agent's particles were
+        worth at least.
 
         >>> from distfilt.models import constant_velocity
         >>> f = ParticleFilter(
@@ -285,11 +286,15 @@ class ParticleFilter(
         # N_eff = 1 / Σ w²
         is_due = state.effective_size < self.ess_threshold * self.members
         if not is_due.any():
-            return log_weights, ancestors
+            return log_weights, ancestors, np.inf
         is_few = is_due & self._has_few_ancestors(ancestors)
-        sizes, shares = measure_families(before, state.weights, ancestors, is_few)
+        is_few[state.failed] = False
+        least = max(_FEWEST, 0.02 * self.members)
+        sizes, shares = measure_families(
+            before, state.weights, ancestors, is_few, least
+        )
         is_renewed = is_few & (shares > 0.5)
-        is_collapsed = sizes < max(_FEWEST, 0.02 * self.members)
+        is_collapsed = sizes < least
         counts = self._select(
             stack, log_weights, state.weights, is_due, offset, ancestors
         )
@@ -311,7 +316,7 @@ class ParticleFilter(
             )
         # Families begin anew once the noise has separated their members.
         ancestors[is_renewed] = np.arange(self.members)
-        return log_weights, ancestors
+        return log_weights, ancestors, float(sizes.min(initial=np.inf))
 
     def _separate_copies(
         self,
@@ -343,6 +348,8 @@ class ParticleFilter(
         """Return the bandwidth of the jitter; by default none if the model has noise."""
         if self.jitter is not None:
             return self.jitter
+        if self.model.has_state_noise:
+            return 0.0
         # A step of no length adds no noise, so a unit step shows whether the model has any.
         if np.count_nonzero(self.model.Q(t, dt or 1.0)):
             return 0.0
@@ -376,7 +383,7 @@ class ParticleFilter(
         log_weights[rows] = -np.log(self.members)
         return counts
 
-    def _warn(self, state: ParticleState) -> None:
+    def _warn(self, state: ParticleState, worth: float = np.inf) -> None:
         """Warn if few particles are distinct, or if few of them have any weight.
 
         >>> import warnings
@@ -408,7 +415,6 @@ class ParticleFilter(
         """
         points = state.particles
         size = state.effective_size
-        worth = self._measure_related(state)
         if np.count_nonzero(state.failed):
             points = points[~state.failed]
             size = size[~state.failed]
@@ -427,13 +433,6 @@ class ParticleFilter(
             return
         time = format_number(state.t)
         particles.warn_of_collapse(f"t = {time} s: {problem}", "jitter=")
-
-    def _measure_related(self, state: ParticleState) -> float:
-        """Return the least effective number of an agent's families; infinity if there are many."""
-        ancestors = find_ancestors(state)
-        is_few = self._has_few_ancestors(ancestors) & ~state.failed[..., None]
-        sizes, _ = measure_families(state.particles, state.weights, ancestors, is_few)
-        return float(sizes.min(initial=np.inf))
 
     def _count_distinct(self, points: Array, fewest: float) -> float:
         """Return a lower bound of each agent's number of distinct particles, above `fewest`."""
@@ -462,13 +461,18 @@ def find_ancestors(state: ParticleState) -> Indices:
 
 
 def measure_families(
-    points: Array, weights: Array, ancestors: Indices, agents: Mask
+    points: Array,
+    weights: Array,
+    ancestors: Indices,
+    agents: Mask,
+    least: float = np.inf,
 ) -> tuple[Array, Array]:
     """Return what the particles of some agents are worth, and how far families are separated.
 
     Families of weights W_a and of the share s of the variance within them have a weighted mean
     with the error of 1 / (Σ W_a² (1 - s)) independent particles. The first result is this number
-    and the second s, each the least over the components; infinity and one for other agents.
+    and the second s, each the least over the components; infinity and one for other agents. From
+    `least` families on they are not looked into: their number bounds the first, and s is zero.
 
     >>> x = np.array([[[0.0], [0.1], [1.0], [1.1]], [[0.0], [1.0], [0.0], [1.0]]])
     >>> families = np.array([[0, 0, 3, 3]] * 2)
@@ -486,6 +490,11 @@ def measure_families(
         starts = np.flatnonzero(np.diff(labels, prepend=labels[0] - 1))
         counts = np.diff(starts, append=labels.size)
         mass = np.add.reduceat(w, starts)
+        n_families = 1 / (mass**2).sum()
+        if n_families >= least:
+            sizes[index] = n_families
+            shares[index] = 0.0
+            continue
         # Means of the families, at each of their members.
         positive = np.maximum(mass, np.finfo(float).tiny)
         means = np.repeat(np.add.reduceat(w * x, starts) / positive, counts, axis=0)
@@ -497,8 +506,8 @@ def measure_families(
         if not is_spread.any():
             continue
         shares[index] = min((within[is_spread] / total[is_spread]).min(), 1.0)
-        between = (mass**2).sum() * (1 - shares[index])
-        sizes[index] = 1 / between if between > 0 else np.inf
+        if shares[index] < 1:
+            sizes[index] = n_families / (1 - shares[index])
     return sizes, shares
 
 
@@ -506,7 +515,7 @@ def _moments_by_logs(predicted: Array, log_weights: Array) -> tuple[Array, Array
     weights = np.exp(log_weights)
     if not all_finite(predicted):
         # Of the particles that can see; NaN if there are none.
-        sees = ~np.isnan(predicted).any(axis=-1)
+        sees = np.asarray(~np.isnan(predicted).any(axis=-1))
         weights = np.where(sees, weights, 0.0)
         total = weights.sum(axis=-1, keepdims=True)
         weights = weights / np.where(total > 0, total, np.nan)

@@ -49,6 +49,10 @@ class State(FrozenModel):
     log_likelihood, nis, n_observed : ndarray, (*runs, A), optional
         Scores of the observations of the last step, see
         :class:`~distfilt.filters.ScoresObservations`; None if they are not recorded.
+    assimilated : tuple
+        The observations of the times that are kept, by which repeated ones are found.
+    warned : tuple of str
+        Warnings that are given once, and have been.
 
     Examples
     --------
@@ -64,7 +68,11 @@ class State(FrozenModel):
         default=None, kw_only=True
     )
     nis: Annotated[Array, "...", ALLOW_NAN] | None = field(default=None, kw_only=True)
-    n_observed: Annotated[Array, "...", ALLOW_NAN] | None = field(default=None, kw_only=True)
+    n_observed: Annotated[Array, "...", ALLOW_NAN] | None = field(
+        default=None, kw_only=True
+    )
+    assimilated: tuple[Any, ...] = field(default=(), kw_only=True)
+    warned: tuple[str, ...] = field(default=(), kw_only=True)
 
     def __repr__(self) -> str:
         """Show time and agents; the arrays are long."""
@@ -105,7 +113,9 @@ class State(FrozenModel):
         The file appears whole or not at all: a full disk leaves an earlier one as it was. Its last
         32 bytes are the SHA-256 of those before.
         """
-        save_state(self, path)
+        # Sensors that came with an observation cannot be written.
+        entries = [entry for entry in self.assimilated if isinstance(entry[2], int)]
+        save_state(self.replace(assimilated=tuple(entries)), path)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
@@ -140,13 +150,9 @@ class SensorState(State):
     last_changes, references : tuple
         The time of the last observation of each sensor of changes, and the beliefs about those of
         them that are not in the history.
-    assimilated : tuple
-        The observations of the times that are kept, by which repeated ones are found.
     unseen : ndarray, (*runs, A), optional
         How many observations each agent left out in the last step, since the sensor cannot see
         from its state; None if there were none.
-    warned : tuple of str
-        Warnings that are given once, and have been.
 
     Examples
     --------
@@ -166,9 +172,7 @@ class SensorState(State):
     pending: tuple[Any, ...] = field(default=(), kw_only=True)
     last_changes: tuple[Any, ...] = field(default=(), kw_only=True)
     references: tuple[Any, ...] = field(default=(), kw_only=True)
-    assimilated: tuple[Any, ...] = field(default=(), kw_only=True)
     unseen: Annotated[Array, "..."] | None = field(default=None, kw_only=True)
-    warned: tuple[str, ...] = field(default=(), kw_only=True)
 
     # Without an annotation it is no field of the dataclass.
     belief_field = "belief", tuple[Any, ...]()
@@ -232,15 +236,6 @@ class SensorState(State):
                 )
             )
         return tuple(states)
-
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the state to one .npz file; :meth:`load` gives back the same bits.
-
-        Only sensors that came with an observation are not written, so that a repetition of such
-        an observation is not found after loading.
-        """
-        entries = [entry for entry in self.assimilated if isinstance(entry[2], int)]
-        save_state(self.replace(assimilated=tuple(entries)), path)
 
     def mask_failed(self, values: Array) -> Array:
         """Return values (*runs, ...) for the record: NaN in runs that have failed."""

@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, ca
 
 import numpy as np
 
+from ..linalg import cholesky, log_det, quadratic_form
 from ..models import Model
 from ..periods import check_sensor, gather
-from ..linalg import cholesky, log_det, quadratic_form
 from ..sensors import LikelihoodSensor, Sensor
 from ..validation import Array, Mask, call_user, format_number
 from ..validation.first_use import needs_check
 from . import failures
+from .changes import Previous, References
 from .exchange import Known, collect_observations, fuse_beliefs
 from .failures import RECOVERABLE, FilterError, Row
-from .changes import Previous, References
 from .observations import Observation
 from .repetition import note_assimilated
 from .states import SensorState, State
@@ -144,13 +144,14 @@ class Step(Generic[S]):
         self.pending: tuple[Observation, ...] = ()
         # How many observations cannot be seen from a belief, if there are any.
         self.unseen: Array | None = None
-        self.warned: tuple[str, ...] = getattr(state, "warned", ())
+        self.warned: tuple[str, ...] = state.warned
+        self.has_sensors = hasattr(filter_, "agent_sensors")
         # Sensors of changes need the beliefs about the times of their last observations.
         self.lagged = self.times
         self.references: References | None = None
         sources = self.filter.change_sources if isinstance(state, SensorState) else ()
         if sources:
-            self.references = References(state, t, observations, sources)
+            self.references = References(self.state, t, observations, sources)
             times = {*self.lagged, *self.references.times}
             self.times = tuple(sorted(times))
         # Counted only with a gate.
@@ -478,9 +479,15 @@ class Step(Generic[S]):
             if "history" not in belief:
                 history = [pair for pair in pairs if pair[0] in self.lagged]
                 belief["history"] = tuple(history)
-            belief |= self._describe_observations(state, pairs)
+            belief |= self._describe_observations(pairs)
             belief["failed"] = self.failed
             belief["pending"] = self.pending
+        if self.has_sensors:
+            kept_times = (*self.lagged, self.t)
+            belief["assimilated"] = note_assimilated(
+                self.observations, self.delayed, state.assimilated, kept_times
+            )
+            belief["warned"] = self.warned
         # The messages in the step are in the channel's ledger.
         ledger = state.ledger if self.channel is None else self.channel.ledger
         # A failed run has no score.
@@ -492,17 +499,10 @@ class Step(Generic[S]):
         return new
 
     def _describe_observations(
-        self, state: SensorState, past: tuple[tuple[float, Array], ...]
+        self, past: tuple[tuple[float, Array], ...]
     ) -> dict[str, Any]:
-        """Return the state's fields about the observations."""
-        kept_times = (*self.lagged, self.t)
-        fields: dict[str, Any] = {
-            "assimilated": note_assimilated(
-                self.observations, self.delayed, state.assimilated, kept_times
-            ),
-            "unseen": self.unseen,
-            "warned": self.warned,
-        }
+        """Return the state's fields about observations that are compared with beliefs."""
+        fields: dict[str, Any] = {"unseen": self.unseen}
         if self.references is not None:
             needed = self.references.kept
             fields["last_changes"] = self.references.last_changes
@@ -680,7 +680,7 @@ class Received:
         owners = np.zeros(self.sensor_index.shape, dtype=np.intp)
         for k, part in enumerate(self.parts):
             owners[part.cells] = k
-        return self.parts[owners[g, column]].sensor.kind
+        return str(self.parts[owners[g, column]].sensor.kind)
 
     def log_likelihood(self, states: Array) -> tuple[Received, Array | float]:
         """Return the log-likelihoods of states (*runs, G, N, d) by sensors that are likelihoods.
@@ -697,7 +697,8 @@ class Received:
             members = states[..., part.agents, :, :]
             values = sensor.evaluate(members, observed[..., None, :])
             # An agent may have several observations of one sensor.
-            np.add.at(logs, (..., part.agents, slice(None)), values)
+            index: Any = (..., part.agents, slice(None))
+            np.add.at(logs, index, values)
         rest = self.with_target(target)
         # The missing numbers get a unit variance, so that R has an inverse.
         rest.noise = np.array(
@@ -943,6 +944,12 @@ def _gather_predictions(
     """Bring a sensor's predictions (*runs, G, N, m) of states (*runs, G, N, d) onto one branch."""
     if values.shape[-2] == 1:
         return values
+    half_periods = sensor.half_periods
+    if half_periods is not None:
+        # The usual case: values within half a period are on one branch as they are.
+        low = values.min(axis=-2)
+        if (values.max(axis=-2) - low < half_periods).all():
+            return values
     mean = states.mean(axis=-2, keepdims=True)
     previous_mean = None
     if sensor.uses_previous and previous is not None:

@@ -291,7 +291,7 @@ def _predict(
     # Standard deviations of the state, from those of its error
     std = deviations(basis @ present @ basis.mT)
     a = projection @ model.jacobian(x, t, dt, std=std) @ basis
-    noise_cov = projection @ model.Q(t, dt) @ projection.mT
+    noise_cov = projection @ model.noise_at(x, t, dt) @ projection.mT
     cov = a @ present @ a.mT + noise_cov
     if p.shape[-1] == k:
         return forecast, cov

@@ -2,6 +2,7 @@
 
 from . import orbit
 from .base import LinearModel, Model, simulate
+from .inputs import InputModel, Inputs
 from .motion import constant_velocity, lorenz63, rk4
 from .orbit import occulted, orbits, rsw_frame
 from .pendulum import (
@@ -16,6 +17,8 @@ from .satellite import clohessy_wiltshire, satellite_pose
 from .swarm import RotatingMixture, Swarm, rotating_swarm
 
 __all__ = [
+    "InputModel",
+    "Inputs",
     "LinearModel",
     "Model",
     "RotatingMixture",

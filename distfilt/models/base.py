@@ -6,8 +6,9 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
-from typing import Annotated, cast
+from functools import cached_property, lru_cache, partial
+from inspect import Parameter, signature
+from typing import Annotated, ClassVar, cast
 
 import numpy as np
 
@@ -95,6 +96,8 @@ class Model(FrozenModel):
     units: tuple[str, ...] = field(default=(), kw_only=True)
     periods: PeriodsArgument = field(default=(), kw_only=True)
 
+    has_state_noise: ClassVar[bool] = False
+
     def __post_init__(self) -> None:
         super().__post_init__()
         periods = read_periods(self.periods, self.dim, self.names)
@@ -126,6 +129,16 @@ class Model(FrozenModel):
         """Covariance of the noise that a step from `t` to `t` + `dt` adds, (d, d), read-only."""
         cov, _ = self._noise(t, dt)
         return cov
+
+    @validated
+    def noise_at(
+        self, x: Annotated[ArrayInput, "... self.dim"], t: float, dt: NonNegativeFloat
+    ) -> Array:
+        """Covariance of the noise that a step from states (..., d) adds: (d, d), or (..., d, d).
+
+        It is Q unless the model has `has_state_noise`.
+        """
+        return self.Q(t, dt)
 
     @validated
     def noise_sqrt(self, t: float, dt: NonNegativeFloat) -> Array:
@@ -211,16 +224,17 @@ def _factorize_noise(data: bytes, dim: int) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class LinearModel(Model):
-    """A model whose transition is a matrix: x(t + dt) = Φ(dt) x(t) + w.
+    """A model whose transition is a matrix: x(t + dt) = Φ(t, dt) x(t) + w.
 
     Parameters
     ----------
     transition_matrix : callable
-        ``transition_matrix(dt) -> Φ``, (d, d). `transition` has to be the product with it, which
-        :meth:`from_transition` guarantees. A warning is given if only its transpose fits
-        `noise_cov`.
+        ``transition_matrix(dt) -> Φ``, (d, d); or ``transition_matrix(t, dt)``, with two arguments,
+        for a matrix that changes with time, from `t` to `t` + `dt`. `transition` has to be the
+        product with it, which :meth:`from_transition` guarantees. A warning is given if only its
+        transpose fits `noise_cov`.
     time_invariant : bool
-        Whether `noise_cov` depends on dt alone. Then both matrices are made once for each dt.
+        Whether both matrices depend on dt alone. Then they are made once for each dt.
 
     Examples
     --------
@@ -229,16 +243,31 @@ class LinearModel(Model):
     ... )
     >>> still.step([1.0, 2.0], 0.0, 0.1)
     array([1., 2.])
+
+    A decay that sets in at t = 10, whose matrix changes with time:
+
+    >>> def decay(t, dt):
+    ...     return np.array([[np.exp(-max(0.0, t + dt - max(t, 10.0)))]])
+    >>> late = LinearModel.from_transition(1, decay, lambda t, dt: np.zeros((1, 1)))
+    >>> [late.step([1.0], t, 1.0).round(3) for t in (0.0, 9.5, 10.0)]
+    [array([1.]), array([0.607]), array([0.368])]
     """
 
-    transition_matrix: Callable[[float], Array] = field(kw_only=True)
+    transition_matrix: Callable[..., Array] = field(kw_only=True)
     time_invariant: bool = field(default=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.time_invariant and self.varies_with_time:
+            raise ValueError(
+                "time_invariant must be False for a transition_matrix(t, dt), got True"
+            )
 
     @classmethod
     def from_transition(
         cls,
         dim: int,
-        transition_matrix: Callable[[float], Array],
+        transition_matrix: Callable[..., Array],
         noise_cov: Callable[[float, float], Array],
         *,
         names: tuple[str, ...] = (),
@@ -246,10 +275,10 @@ class LinearModel(Model):
         periods: PeriodsArgument = (),
         time_invariant: bool = False,
     ) -> LinearModel:
-        """Build the model from its transition matrix, ``transition_matrix(dt) -> (d, d)``."""
+        """Build the model from its matrix, ``transition_matrix(dt)`` or ``(t, dt)``, to (d, d)."""
         return cls(
             dim,
-            partial(_multiply, transition_matrix, dim),
+            partial(_multiply, transition_matrix, dim, _takes_two(transition_matrix)),
             noise_cov,
             names=names,
             units=units,
@@ -293,7 +322,7 @@ class LinearModel(Model):
         """Whether Φᵀ in place of Φ makes two half steps add the noise of a whole step."""
         # The noise of two half steps, propagated by Φ, is that of a whole step.
         half = dt / 2
-        phi = self.F(half)
+        phi = self.F(half, t + half)
         first = call_user(self.noise_cov, t, half)
         second = call_user(self.noise_cov, t + half, half)
         # Q(t, dt) = Φ Q(t, dt/2) Φᵀ + Q(t + dt/2, dt/2)
@@ -304,11 +333,24 @@ class LinearModel(Model):
         rounding = 1e-11 * np.abs(cov).max()
         return bool(transposed_error < rounding < 1e-2 * error)
 
+    @cached_property
+    def varies_with_time(self) -> bool:
+        """Whether the matrix depends on the time at which a step begins, ``(t, dt)``."""
+        return _takes_two(self.transition_matrix)
+
     @validated
-    def F(self, dt: NonNegativeFloat) -> Array:
-        """The matrix Φ of a step of `dt` seconds, (d, d)."""
-        phi = call_user(self.transition_matrix, dt)
-        return check_array(phi, "transition_matrix", (self.dim, self.dim))
+    def F(self, dt: NonNegativeFloat, t: float | None = None) -> Array:
+        """The matrix Φ of a step of `dt` seconds from time `t`, (d, d).
+
+        `t` is needed if the matrix changes with time.
+        """
+        if self.varies_with_time and t is None:
+            raise ValueError(
+                "t must be the time at which the step begins for a matrix that changes with time, "
+                "got None"
+            )
+        args = (t, dt) if self.varies_with_time else (dt,)
+        return _make_matrix(self.transition_matrix, self.dim, *args)
 
     @validated
     def jacobian(
@@ -320,15 +362,40 @@ class LinearModel(Model):
         std: Annotated[ArrayInput, "... self.dim"] | None = None,
     ) -> Array:
         """Derivative of a step, the same matrix for all states, as (..., d, d)."""
-        return np.full((*x.shape, self.dim), self.F(dt))
+        return np.full((*x.shape, self.dim), self.F(dt, t))
+
+
+def _takes_two(function: Callable[..., Array]) -> bool:
+    """Whether a function needs two arguments, (t, dt), and not dt alone."""
+    try:
+        parameters = signature(function).parameters.values()
+    except (TypeError, ValueError):
+        # Functions of C have no signature.
+        return False
+    positional = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    needed = [p for p in parameters if p.kind in positional and p.default is p.empty]
+    return len(needed) == 2
+
+
+def _make_matrix(
+    transition_matrix: Callable[..., Array], dim: int, *args: float | None
+) -> Array:
+    """Call a transition matrix with dt, or with (t, dt), and check its result."""
+    phi = call_user(transition_matrix, *args)
+    return check_array(phi, "transition_matrix", (dim, dim))
 
 
 def _multiply(
-    transition_matrix: Callable[[float], Array], dim: int, x: Array, t: float, dt: float
+    transition_matrix: Callable[..., Array],
+    dim: int,
+    varies_with_time: bool,
+    x: Array,
+    t: float,
+    dt: float,
 ) -> Array:
     """Transition of a linear model."""
-    phi = call_user(transition_matrix, dt)
-    phi = check_array(phi, "transition_matrix", (dim, dim))
+    args = (t, dt) if varies_with_time else (dt,)
+    phi = _make_matrix(transition_matrix, dim, *args)
     # Rows are states: x Φᵀ. With a copy of the transpose it takes half the time of a view's.
     return np.asarray(x @ np.ascontiguousarray(phi.T))
 

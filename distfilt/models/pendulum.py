@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
+from ..periods import PeriodsArgument
 from ..validation import (
     Array,
     ArrayInput,
@@ -20,7 +21,6 @@ from ..validation import (
     PositiveFloat,
     validated,
 )
-from ..periods import PeriodsArgument
 from .base import Model
 from .motion import integrate
 

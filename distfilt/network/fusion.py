@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -42,14 +42,13 @@ __all__ = [
 ]
 
 
-
 def _find_uncertain(covs: Array) -> Mask:
     """Return which components have a variance, (d,); the others are constants known to all."""
     variances = np.diagonal(covs, axis1=-2, axis2=-1).reshape(-1, covs.shape[-1])
     is_uncertain: Mask = (variances != 0).any(axis=0)
     # A component with a covariance but no variance is left to the check of definiteness.
     is_correlated = (covs != 0).reshape(-1, *covs.shape[-2:]).any(axis=(0, 1))
-    return is_uncertain | is_correlated
+    return np.asarray(is_uncertain | is_correlated)
 
 
 def _check_definite_or_known(value: Array, name: str) -> None:
@@ -471,11 +470,11 @@ def _repeat_uncertain(
     new_means = means.copy()
     new_covs = covs.copy()
     if is_uncertain.any():
-        block = np.ix_(is_uncertain, is_uncertain)
+        block: Any = (..., *np.ix_(is_uncertain, is_uncertain))
         periods = _select_periods(channel.periods, is_uncertain)
-        part = (means[..., is_uncertain], covs[(..., *block)])
+        part = (means[..., is_uncertain], covs[block])
         part = _repeat_all(part, channel, rounds, fuse, periods)
-        new_means[..., is_uncertain], new_covs[(..., *block)] = part
+        new_means[..., is_uncertain], new_covs[block] = part
     return new_means, new_covs
 
 

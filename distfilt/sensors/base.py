@@ -177,6 +177,14 @@ class Sensor(FrozenModel):
         """Whether differences of observations wrap: by `periods` or a function of one's own."""
         return bool(self.periods) or self.residual_function is not None
 
+    @cached_property
+    def half_periods(self) -> Array | None:
+        """Half of each component's period, infinity without one; None without `periods`."""
+        if not self.periods:
+            return None
+        periods = cast(Periods, self.periods)
+        return np.array([np.inf if p is None else 0.5 * p for p in periods])
+
     def bring_near(self, values: Array, reference: Array) -> Array:
         """Return values (..., m) on the branch of a reference, unchecked.
 
@@ -286,7 +294,9 @@ class Sensor(FrozenModel):
             predicted = self.predict(np.eye(dim))
             # Predictions that wrap may be on another branch.
             difference = self.residual(predicted, matrix.T)
-            if not np.allclose(difference, 0.0, atol=1e-9 + 1e-5 * np.abs(matrix).max()):
+            if not np.allclose(
+                difference, 0.0, atol=1e-9 + 1e-5 * np.abs(matrix).max()
+            ):
                 raise ValueError(
                     "linear must return the matrix of h, got one that does not match it"
                 )

@@ -82,7 +82,12 @@ def component(
 def increment(
     indices: DistinctIndices, *, std: Deviation, periods: PeriodsArgument = ()
 ) -> Sensor:
-    """Measure the change of components since the previous observation time, to `std` each.
+    """Measure the change of components since this sensor's last observation, to `std` each.
+
+    Other sensors may observe in between, at any rate, and a message may be lost on its way to a
+    neighbour. Where an observation is missing (NaN, or no event), the next one has the change
+    since the last that came. Ensembles, particles, transport and
+    :func:`distfilt.kalman.mekf` can use it; the other filters refuse it.
 
     The increment of an angle has its period: `periods`, as of :class:`Sensor`.
 

@@ -180,7 +180,7 @@ class LikelihoodSensor(Sensor):
         lead = broadcast_leading(x.shape[:-1], observed.shape[:-1], "observed")
         x = np.broadcast_to(x, (*lead, x.shape[-1]))
         observed = np.broadcast_to(observed, (*lead, self.dim))
-        is_missing = np.isnan(observed).all(axis=-1)
+        is_missing = np.asarray(np.isnan(observed).all(axis=-1))
         if is_missing.all():
             return np.zeros(lead)
         if is_missing.any():

@@ -288,6 +288,9 @@ def stochastic_forecast(
     ... ).ravel()
     array([1., 2.])
     """
+    if model.has_state_noise:
+        # The noise of each member depends on its state.
+        return model.sample_step(ensemble, t, dt, rng=rng)
     forecast = step_members(model, ensemble, t, dt)
     root = model.noise_sqrt(t, dt)
     # Without noise nothing is drawn.
@@ -321,6 +324,11 @@ def exact_forecast(
     >>> bool(abs(forecast.mean()) < 1e-12), float(forecast.var(ddof=1).round(12))
     (True, 1.0)
     """
+    if model.has_state_noise:
+        raise ValueError(
+            "model must have a noise that does not depend on the state for an exact forecast, got "
+            f"a {type(model).__name__}: use stochastic_forecast"
+        )
     forecast = step_members(model, ensemble, t, dt)
     root = model.noise_sqrt(t, dt)
     # Without noise nothing is drawn.

@@ -271,7 +271,7 @@ def log_likelihood(
         missing = np.asarray(is_unseen.any(axis=-1))
         if contradict:
             missing = np.asarray(is_unseen.all(axis=-1))
-            contradicting = (is_unseen & ~missing[..., None]).any(axis=-2)
+            contradicting = np.asarray((is_unseen & ~missing[..., None]).any(axis=-2))
             residual = np.where(is_unseen, 0.0, residual)
         # A missing component gets a zero residual and a unit variance of its own in R.
         present = ~missing

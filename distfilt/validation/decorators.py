@@ -87,7 +87,6 @@ class SignatureConstraints:
                 context.arguments[name] = value
         return arguments
 
-
     def _refuse_positions(self, args: tuple[Any, ...]) -> None:
         """Refuse more arguments by position than there are, naming those to give by name."""
         n_allowed = len(self.positional_names)

@@ -2,7 +2,7 @@
 
 | Project | Report | Here |
 |---|---|---|
-| own | a calibrated bias kept in the state with variance zero, in an unscented filter | equals the state without it |
+| own | a calibrated bias in the state with variance zero, unscented | equals the state without |
 | own | the same in `kalman_filter` and its smoother | equals the state without it |
 | own | agents that share such a constant, by every rule of fusion | equals the state without it |
 

@@ -2,8 +2,8 @@
 
 | Project | Report | Here |
 |---|---|---|
-| own | counts of a Poisson process in a particle filter | posterior of a grid |
-| own | Student's t for outliers, with the filter's threshold, jitter and lag | posterior of a grid |
+| own | counts of a Poisson process in particles | posterior of a grid |
+| own | Student's t for outliers, with threshold, jitter and lag | posterior of a grid |
 | own | noise that grows with the distance | posterior of a grid |
 | own | a count beside a Gaussian sensor, sent to a neighbour | weights by hand |
 | own | such a sensor in a Kalman filter | refused by name |

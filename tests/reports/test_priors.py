@@ -2,7 +2,7 @@
 
 | Project | Report | Here |
 |---|---|---|
-| own | robots that know their own starting place better than the others' | Kalman filters one by one |
+| own | robots that know their own starting place best | Kalman filters one by one |
 | own | one agent that starts from a file of members, the others from Gaussians | each its own |
 
 Each agent is compared with a filter of one agent, started from that agent's prior.

@@ -2,9 +2,9 @@
 
 | Project | Report | Here |
 |---|---|---|
-| own | a landmark begins where it is first seen, correlated with the robot | joint covariance by hand |
-| own | a bias is unknown again after the sensor was restarted | the other components as they were |
-| own | one agent of a network restarts | the others to the bit as they were |
+| own | a landmark begins where it is first seen | joint covariance by hand |
+| own | a bias is unknown after a restart | the others as they were |
+| own | one agent of a network restarts | the others as they were |
 
 Moments of a linear function of a Gaussian are written out.
 """

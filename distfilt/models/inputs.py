@@ -1,0 +1,214 @@
+"""Models that are driven by measured inputs, such as odometry, whose noise enters with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Annotated, ClassVar
+
+import numpy as np
+
+from ..derivatives import central_difference
+from ..linalg import factor, symmetrise
+from ..periods import PeriodsArgument
+from ..validation import (
+    Array,
+    ArrayInput,
+    FrozenModel,
+    NonNegativeFloat,
+    PositiveInt,
+    PositiveSemidefinite,
+    Rng,
+    Times,
+    call_user,
+    check_array,
+    format_number,
+    validated,
+)
+from .base import Model
+
+__all__ = ["InputModel", "Inputs"]
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs(FrozenModel):
+    """Inputs u, each of which holds from its time until the next one.
+
+    Parameters
+    ----------
+    times : array_like, (T,)
+        When each begins to hold, in s, increasing; the last one holds on.
+    values : array_like, (T, k)
+    cov : array_like, (k, k)
+        Covariance of the error of each, which holds as long as the input does; errors of different
+        inputs are independent.
+
+    Examples
+    --------
+    >>> wheels = Inputs([0.0, 1.0], [[0.5, 0.0], [0.5, 0.2]], np.diag([0.01, 0.001]))
+    >>> [(t, dt, u.tolist()) for t, dt, u in wheels.pieces(0.5, 1.0)]
+    [(0.5, 0.5, [0.5, 0.0]), (1.0, 0.5, [0.5, 0.2])]
+    """
+
+    times: Times
+    values: Annotated[Array, "T k"]
+    cov: Annotated[PositiveSemidefinite, "k k"]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not len(self.times):
+            raise ValueError("times must have at least one entry, got none")
+
+    def pieces(self, t: float, dt: float) -> list[tuple[float, float, Array]]:
+        """Return the parts of a step in which one input holds: begin, length and input."""
+        if t < self.times[0]:
+            raise ValueError(
+                f"times must begin at the model's first step at {format_number(t)} or before, "
+                f"got {format_number(self.times[0])}"
+            )
+        end = t + dt
+        # To rounding: a sum of steps may fall short of the time of an input.
+        tolerance = 1e-9 * max(1.0, abs(t))
+        first = int(np.searchsorted(self.times, t + tolerance, side="right")) - 1
+        last = int(np.searchsorted(self.times, end - tolerance, side="left"))
+        edges = [t, *self.times[first + 1 : last].tolist(), end]
+        return [
+            (a, b - a, self.values[first + k])
+            for k, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True))
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class InputModel(Model):
+    r"""A model that is driven by inputs with noise, x(t + dt) = f(x, u + ε, dt) + w.
+
+    The inputs' noise enters where the inputs do, so that it is that of the body's frame: with
+    :math:`\mathbf G(\mathbf x)=\partial\mathbf f/\partial\mathbf u` its covariance in the state is
+    :math:`\mathbf G\boldsymbol\Sigma\mathbf G^\top`, which depends on the state. Members move with
+    draws of the inputs; Gaussian filters use G at their mean. Made by :meth:`from_inputs`.
+
+    Parameters
+    ----------
+    inputs : Inputs
+    driven_transition : callable
+        ``driven_transition(x, u, dt) -> x`` on states (..., d) and inputs (..., k).
+
+    Examples
+    --------
+    Odometry: a speed and a rate of turn. The robot's error across its heading grows with the
+    error of the turn, whatever the heading is.
+
+    >>> def drive(x, u, dt):
+    ...     heading = x[..., 2] + dt * u[..., 1] / 2
+    ...     east = x[..., 0] + dt * u[..., 0] * np.cos(heading)
+    ...     north = x[..., 1] + dt * u[..., 0] * np.sin(heading)
+    ...     return np.stack([east, north, x[..., 2] + dt * u[..., 1]], axis=-1)
+    >>> odometry = Inputs([0.0, 1.0], [[1.0, 0.0], [1.0, 0.0]], np.diag([0.04, 0.0]))
+    >>> robot = InputModel.from_inputs(3, drive, odometry)
+    >>> robot.noise_at([0.0, 0.0, 0.0], 0.0, 1.0).round(3).diagonal()
+    array([0.04, 0.  , 0.  ])
+    >>> robot.noise_at([0.0, 0.0, np.pi / 2], 0.0, 1.0).round(3).diagonal()
+    array([0.  , 0.04, 0.  ])
+    """
+
+    inputs: Inputs = field(kw_only=True)
+    driven_transition: Callable[[Array, Array, float], Array] = field(kw_only=True)
+
+    has_state_noise: ClassVar[bool] = True
+
+    @classmethod
+    def from_inputs(
+        cls,
+        dim: PositiveInt,
+        driven_transition: Callable[[Array, Array, float], Array],
+        inputs: Inputs,
+        noise_cov: Callable[[float, float], Array] | None = None,
+        *,
+        names: tuple[str, ...] = (),
+        units: tuple[str, ...] = (),
+        periods: PeriodsArgument = (),
+    ) -> InputModel:
+        """Build the model from ``driven_transition(x, u, dt)``; `noise_cov` adds further noise."""
+        return cls(
+            dim,
+            partial(_drive, driven_transition, inputs),
+            partial(_no_noise, dim) if noise_cov is None else noise_cov,
+            names=names,
+            units=units,
+            periods=periods,
+            inputs=inputs,
+            driven_transition=driven_transition,
+        )
+
+    @validated
+    def sample_step(
+        self,
+        x: Annotated[ArrayInput, "... self.dim"],
+        t: float,
+        dt: NonNegativeFloat,
+        *,
+        rng: Rng,
+    ) -> Array:
+        """Move states (..., d) from `t` to `t` + `dt`, each with draws of the inputs' noise."""
+        # The check of `transition` is made here too.
+        self.step(x, t, dt)
+        root = factor(self.inputs.cov)
+        for _, length, u in self.inputs.pieces(t, dt):
+            normal = rng.standard_normal((*x.shape[:-1], u.size))
+            x = _move(self.driven_transition, x, u + normal @ root.T, length)
+        lower = self.noise_sqrt(t, dt)
+        return np.asarray(x + rng.standard_normal(x.shape) @ lower.T)
+
+    @validated
+    def noise_at(
+        self, x: Annotated[ArrayInput, "... self.dim"], t: float, dt: NonNegativeFloat
+    ) -> Array:
+        """Covariance of the noise that a step from states (..., d) adds, (..., d, d)."""
+        cov = np.zeros((*x.shape, self.dim))
+        for _, length, u in self.inputs.pieces(t, dt):
+            inputs = np.broadcast_to(u, (*x.shape[:-1], u.size))
+            slope, gain = self._derivatives(x, inputs, length)
+            # F P Fᵀ of the earlier inputs' noise, and G Σ Gᵀ of this one's
+            cov = slope @ cov @ slope.mT + gain @ self.inputs.cov @ gain.mT
+            x = _move(self.driven_transition, x, inputs, length)
+        return symmetrise(cov) + self.Q(t, dt)
+
+    def _derivatives(self, x: Array, u: Array, dt: float) -> tuple[Array, Array]:
+        """Return the derivatives of a piece by the states and by the inputs."""
+        d = x.shape[-1]
+
+        def move(joint: Array) -> Array:
+            return _move(self.driven_transition, joint[..., :d], joint[..., d:], dt)
+
+        slope = central_difference(move, np.concatenate([x, u], axis=-1), np.subtract)
+        return slope[..., :d], slope[..., d:]
+
+
+def _no_noise(dim: int, t: float, dt: float) -> Array:
+    return np.zeros((dim, dim))
+
+
+def _drive(
+    driven_transition: Callable[[Array, Array, float], Array],
+    inputs: Inputs,
+    x: Array,
+    t: float,
+    dt: float,
+) -> Array:
+    """Move states by the inputs as they were measured."""
+    for _, length, u in inputs.pieces(t, dt):
+        x = _move(driven_transition, x, u, length)
+    return x
+
+
+def _move(
+    driven_transition: Callable[[Array, Array, float], Array],
+    x: Array,
+    u: Array,
+    dt: float,
+) -> Array:
+    """Move states (..., d) by inputs (..., k) that broadcast to them."""
+    inputs = np.broadcast_to(u, (*x.shape[:-1], u.shape[-1])).copy()
+    moved = call_user(driven_transition, x.copy(), inputs, dt)
+    return check_array(moved, "driven_transition", x.shape, finite=False)

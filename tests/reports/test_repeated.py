@@ -1,0 +1,398 @@
+"""What came twice counts once; weights, angles and times that are given in another scale.
+
+==================================  ==========================================================
+Report                              Situation
+==================================  ==========================================================
+robot_localization issue 336        messages with the same time stamp come twice
+robot_localization issue 451        a measurement of a time that was processed already
+mcstate issue 75, figaro issue 175  weights in place of their logarithms
+MSS pull 18, filterpy issue 305     degrees in place of radians
+fuse pull 74                        a start at time 0, and a first time of the clock
+own                                 a delayed copy, a copy after saving, a second sensor
+==================================  ==========================================================
+"""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from distfilt import coupling
+from distfilt.filters import (
+    EnsembleFilter,
+    GaussianFilter,
+    InformationIncrementFilter,
+    MixtureFilter,
+    Observation,
+    ParticleFilter,
+    TransportFilter,
+)
+from distfilt.kalman import QuaternionChart, mekf
+from distfilt.models import Model, constant_velocity, satellite_pose, simulate
+from distfilt.network import graphs
+from distfilt.sensors import (
+    Sensor,
+    bearing,
+    component,
+    distance,
+    line_angle,
+    range_bearing,
+    stack,
+)
+from distfilt.updates import effective_size
+
+WALK = constant_velocity(sigma=0.3, axes=1)
+EYE = component([0], std=0.5)
+PRIOR = (np.zeros(2), np.eye(2))
+FAMILIES: dict[str, Callable[..., Any]] = {
+    "gaussian": GaussianFilter,
+    "gaussian, unscented": partial(GaussianFilter, linearization="unscented"),
+    "ensemble": partial(EnsembleFilter, members=50),
+    "ensemble, exact": partial(EnsembleFilter.exact, members=50),
+    "particle": partial(ParticleFilter, members=500),
+    "transport": partial(TransportFilter, members=40),
+    "mixture": partial(MixtureFilter, target_dim=1),
+}
+EACH = pytest.mark.parametrize("family", FAMILIES)
+TWICE = "observations must differ to count each"
+
+
+def start_of(f: Any, **options: Any) -> Any:
+    return f.start(PRIOR, rng=np.random.default_rng(0), **options)
+
+
+def means(f: Any, state: Any) -> np.ndarray:
+    return np.asarray(f.summarize(state).mean)
+
+
+# Twice ---------------------------------------------------------------------------------
+
+
+@EACH
+@pytest.mark.parametrize("copied", [lambda o: o, copy.copy, copy.deepcopy])
+@pytest.mark.parametrize("way", ["events", "step"])
+def test_the_same_observation_twice(family: str, copied: Any, way: str) -> None:
+    """The result is that of one of them, to the bit, and one warning says so."""
+    f = FAMILIES[family](WALK, [EYE])
+    one = Observation(1.0, 0, [0.3])
+    start = start_of(f)
+
+    def assimilate(entries: list[Observation]) -> np.ndarray:
+        if way == "step":
+            return means(f, f.step(start, 1.0, [entries]))
+        return np.asarray(f.run(start, None, entries)["mean"].values[-1])
+
+    expected = assimilate([one])
+    with pytest.warns(RuntimeWarning, match=TWICE) as caught:
+        found = assimilate([one, copied(one)])
+    assert len(caught) == 1 and (found == expected).all()
+
+
+@EACH
+def test_a_step_that_is_repeated_at_its_own_time(family: str) -> None:
+    f = FAMILIES[family](WALK, [EYE])
+    state = f.step(start_of(f), 1.0, [[0.3]])
+    with pytest.warns(RuntimeWarning, match="sensor 0 at t = 1 s twice"):
+        again = f.step(state, 1.0, [np.array([0.3])])
+    nothing = f.step(state, 1.0, [None])
+    assert (means(f, again) == means(f, nothing)).all()
+
+
+@pytest.mark.parametrize(
+    "family", ["gaussian", "ensemble", "particle", "transport", "gaussian, unscented"]
+)
+def test_a_delayed_copy(family: str, tmp_path: Any) -> None:
+    """Also after saving, and of one that was delayed itself."""
+    f = FAMILIES[family](WALK, [EYE], lag=3)
+    one = Observation(1.0, 0, [0.3])
+    value = np.array([0.3])
+    state = f.step(start_of(f), 1.0, [value])
+    value[0] = 9.0  # the user's array may be used again
+    state.save(tmp_path / "state.npz")
+    state = type(state).load(tmp_path / "state.npz")
+    plain = f.step(state, 2.0, [[0.5]])
+    with pytest.warns(RuntimeWarning, match=TWICE):
+        state = f.step(state, 2.0, [[0.5]], delayed=[one])
+    assert (means(f, state) == means(f, plain)).all()
+    # The warning is given once in a chain of states.
+    with warnings.catch_warnings(action="error"):
+        state = f.step(state, 2.5, [None], delayed=[one])
+    other = Observation(2.0, 0, [0.7])
+    start = f.step(start_of(f), 2.0, [None])
+    once = f.step(start, 3.0, [None], delayed=[other])
+    with pytest.warns(RuntimeWarning, match=TWICE):
+        twice = f.step(start, 3.0, [None], delayed=[other, copy.copy(other)])
+    assert (means(f, once) == means(f, twice)).all()
+    with pytest.warns(RuntimeWarning, match=TWICE):
+        later = f.step(once, 3.5, [None], delayed=[other])
+    plain = f.step(once, 3.5, [None])
+    assert (means(f, later) == means(f, plain)).all()
+
+
+def test_a_network_that_delivers_twice() -> None:
+    """Events of a run with delayed copies; agents share what they observe."""
+    f = GaussianFilter(WALK, [EYE, EYE], graphs.path(2), lag=3)
+    events = [Observation(float(t), t % 2, [0.1 * t]) for t in range(1, 6)]
+    times = np.arange(1.0, 6.0)
+    expected = f.run(start_of(f), times, events)
+    late = [o.replace(arrival_time=o.t + 1.5) for o in events[:3]]
+    with pytest.warns(RuntimeWarning, match=TWICE):
+        run = f.run(start_of(f), times, [*events, events[1]], delayed=late)
+    assert (run["mean"].values == expected["mean"].values).all()
+    assert (run["variance"].values == expected["variance"].values).all()
+
+
+def test_increments_of_what_came_twice() -> None:
+    f = InformationIncrementFilter(WALK, [EYE] * 2, graphs.path(2), target_dim=2)
+    one = Observation(1.0, 0, [0.3])
+    expected = means(f, f.step(start_of(f), 1.0, [one, None]))
+    with pytest.warns(RuntimeWarning, match=TWICE):
+        found = means(f, f.step(start_of(f), 1.0, [[one, one], None]))
+    assert (found == expected).all()
+
+
+def test_two_that_differ_count_both() -> None:
+    """Another value, sensor, time, agent, or another place of a sensor that comes along."""
+    f = GaussianFilter(WALK, [[EYE, EYE], EYE], share_observations=False, lag=2)
+    pairs = [
+        (Observation(1.0, 0, [0.3]), Observation(1.0, 0, [0.31])),
+        (Observation(1.0, 0, [0.3]), Observation(1.0, 0, [0.3], 1)),
+        (
+            Observation(1.0, 0, [0.5], distance([0], std=0.5, origin=[-1.0])),
+            Observation(1.0, 0, [0.5], distance([0], std=0.5, origin=[1.0])),
+        ),
+    ]
+    with warnings.catch_warnings(action="error"):
+        for pair in pairs:
+            one = f.step(start_of(f), 1.0, [[pair[0]], None]).covariances[0]
+            both = f.step(start_of(f), 1.0, [list(pair), None]).covariances[0]
+            assert np.trace(both) < np.trace(one)
+        state = f.step(start_of(f), 1.0, [pairs[0][0], [0.3]])
+        f.step(state, 2.0, [Observation(2.0, 0, [0.3]), [0.3]])
+    sensor = distance([0], std=0.5, origin=[-1.0])
+    twin = distance([0], std=0.5, origin=[-1.0])
+    entries = [Observation(1.0, 0, [0.5], s) for s in (sensor, twin)]
+    with pytest.warns(RuntimeWarning, match="'?distance sensor"):
+        f.step(start_of(f), 1.0, [entries, None])
+
+
+# Likelihoods for log-weights ---------------------------------------------------------------
+
+
+LIKELIHOODS = [
+    [0.9, 0.0001, 0.02, 0.03],
+    [0.75, 0.25],
+    [0.5, 0.3, 0.2],
+    [3.9, 1e-3, 0.02, 0.0, 0.1],
+]
+
+
+@pytest.mark.parametrize("values", LIKELIHOODS)
+@pytest.mark.parametrize(
+    "call",
+    [
+        effective_size,
+        lambda w: coupling.transform_ensemble(np.arange(float(len(w)))[:, None], w),
+        lambda w: coupling.transport_plans(np.arange(float(len(w)))[:, None], w),
+        lambda w: coupling.correct_moments(
+            np.arange(float(len(w)))[:, None], np.arange(float(len(w)))[:, None], w
+        ),
+    ],
+)
+def test_likelihoods_in_place_of_logarithms(call: Any, values: list[float]) -> None:
+    with pytest.warns(RuntimeWarning, match="log_weights must be logarithms"):
+        call(np.array(values))
+    with pytest.warns(RuntimeWarning, match="log_weights must be logarithms"):
+        call(np.array(values) * (1 - 1e-6))
+
+
+@pytest.mark.parametrize(
+    "logs",
+    [
+        np.log([0.5, 0.25, 0.25]),
+        np.zeros(4),
+        np.full(3, 0.3),
+        [0.0, -1.0, -1e4],
+        # Densities of a small noise are high, and their logarithms positive.
+        18.0 - 0.5 * np.linspace(0.0, 3.0, 20) ** 2,
+        [1.4, -3.0, 0.2],
+    ],
+)
+def test_logarithms_of_any_normalisation_are_not_doubted(logs: Any) -> None:
+    with warnings.catch_warnings(action="error"):
+        effective_size(np.asarray(logs))
+
+
+# Degrees for radians -----------------------------------------------------------------------
+
+
+STILL = Model(2, lambda x, t, dt: x, lambda t, dt: 0.01 * dt * np.eye(2))
+ANGLES = {
+    "bearing": (bearing([0, 1], std=0.05), [60.0]),
+    "line": (line_angle([0, 1], std=0.05), [89.6]),
+    "range": (range_bearing([0, 1], std=[0.5, 0.05]), [1.4, 53.0]),
+    "stack": (
+        stack([component([0], std=0.5), bearing([0, 1], std=0.05)]),
+        [1.0, -120.0],
+    ),
+    "own": (
+        Sensor(
+            1,
+            lambda x: np.arctan2(x[..., 1:], x[..., :1]),
+            [[0.01]],
+            residual_function=lambda a, b: (a - b + np.pi) % (2 * np.pi) - np.pi,
+        ),
+        [53.0],
+    ),
+}
+DEGREES = r"^observations\[0\] must be angles in rad"
+
+
+@pytest.mark.parametrize("kind", ANGLES)
+@pytest.mark.parametrize("n_sensors", [1, 2])
+def test_degrees_in_every_way(kind: str, n_sensors: int) -> None:
+    sensor, value = ANGLES[kind]
+    sensors = sensor if n_sensors == 1 else [component([0], std=1.0), sensor]
+    f = GaussianFilter(STILL, [sensors], lag=1)
+    number = n_sensors - 1
+    start = f.start(([1.0, 1.0], 0.1 * np.eye(2)))
+    one = Observation(1.0, 0, value, number)
+    later = f.step(start, 1.0, [None])
+    calls = {
+        "events": lambda: f.run(start, None, [one]),
+        "step": lambda: f.step(start, 1.0, [[one]]),
+        "list of times": lambda: f.run(start, [1.0], [[[one]]]),
+        "steps": lambda: list(f.steps(start, [1.0], [[one]])),
+        "delayed": lambda: f.step(later, 2.0, [None], delayed=[one]),
+        "delayed in a run": lambda: f.run(
+            start, [1.0, 2.0], [None], delayed=[one.replace(arrival_time=2.0)]
+        ),
+    }
+    if n_sensors == 1:
+        series = np.array([value])
+        calls["array"] = lambda: f.run(start, [1.0], [series])
+        calls["list of arrays"] = lambda: f.run(start, [1.0], [[value]])
+        calls["value"] = lambda: f.step(start, 1.0, [value])
+        calls["with a gap"] = lambda: f.run(
+            start, [1.0, 2.0], [np.concatenate([np.nan * series, series])]
+        )
+    for name, call in calls.items():
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            call()
+        texts = [str(w.message) for w in caught]
+        assert sum(text.startswith("observations[0] must be") for text in texts) == 1, (
+            name,
+            texts,
+        )
+
+
+def test_angles_that_are_right_are_not_doubted() -> None:
+    """In radians of any turn, and in degrees where the sensor's differences are in degrees."""
+    compass = Sensor(
+        1,
+        lambda x: np.degrees(np.arctan2(x[..., 1:], x[..., :1])),
+        [[25.0]],
+        residual_function=lambda a, b: (a - b + 180) % 360 - 180,
+    )
+    declared = compass.replace(residual_function=None, periods=(360.0,))
+    far = range_bearing([0, 1], std=[0.5, 0.05])
+    cases = [(compass, [280.0]), (declared, [280.0]), (far, [900.0, -3.0])]
+    cases.append((bearing([0, 1], std=0.1), [6.5]))
+    for sensor, value in cases:
+        f = GaussianFilter(STILL, [sensor])
+        start = f.start(([1.0, -3.0], 0.1 * np.eye(2)))
+        with warnings.catch_warnings(action="error"):
+            f.step(start, 1.0, [value])
+            f.run(start, None, [Observation(1.0, 0, value)])
+            f.run(start, [1.0], [np.array([value])])
+
+
+# Times of the clock ------------------------------------------------------------------------
+
+
+NOW = 1.7e9
+CLOCK = "must count from the time 0 of the start, got 1700000000.5 first"
+
+
+@EACH
+def test_a_clock_is_noticed_before_the_prior_is_lost(family: str) -> None:
+    f = FAMILIES[family](WALK, [EYE])
+    start = start_of(f)
+    calls = [
+        lambda: f.run(start, [NOW + 0.5, NOW + 1], [np.zeros((2, 1))]),
+        lambda: f.run(start, None, [Observation(NOW + 0.5, 0, [0.1])]),
+        lambda: f.step(start, NOW + 0.5, [[0.1]]),
+        lambda: list(f.steps(start, [NOW + 0.5], [np.zeros((1, 1))])),
+    ]
+    for call in calls:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                call()
+            except Exception as error:
+                assert "1.7e+09" not in str(error)
+        assert [CLOCK in str(w.message) for w in caught].count(True) == 1
+    with warnings.catch_warnings(action="error"):
+        f.step(start_of(f, t=NOW), NOW + 0.5, [[0.1]])
+
+
+def test_seconds_of_a_week_beside_short_steps() -> None:
+    f = GaussianFilter(WALK, [EYE])
+    times = 345_600 + 0.1 * np.arange(5)
+    with pytest.warns(RuntimeWarning, match="got 345600 first"):
+        f.run(start_of(f), times, [np.zeros((5, 1))])
+    with warnings.catch_warnings(action="error"):
+        f.run(start_of(f), [500.0, 500.5, 501.0], [np.zeros((3, 1))])
+        f.run(start_of(f, t=345_599.0), times, [np.zeros((5, 1))])
+
+
+def test_clocks_elsewhere() -> None:
+    with pytest.warns(RuntimeWarning, match=CLOCK):
+        simulate(WALK, [0.0, 0.0], [NOW + 0.5], rng=np.random.default_rng(0))
+    x = np.r_[np.zeros(6), [0.3, 0.2, 0.1], [1.0, 0.0, 0.0, 0.0]]
+    pose = satellite_pose(rate=0.1, sigma=0.1)
+    still = pose.replace(
+        transition=lambda x, t, dt: x,
+        noise_cov=lambda t, dt: np.zeros((13, 13)),
+        derivative=None,
+    )
+    with pytest.warns(RuntimeWarning, match=CLOCK):
+        mekf(
+            x,
+            0.01 * np.eye(12),
+            np.zeros((1, 1)),
+            chart=QuaternionChart(13, 9),
+            model=still,
+            sensors=[component([0], std=0.1)],
+            times=[NOW + 0.5],
+        )
+
+
+def test_messages_print_such_times() -> None:
+    f = GaussianFilter(WALK, [EYE], lag=2)
+    state = f.step(start_of(f, t=NOW), NOW + 0.5, [[1.0]])
+    now = Observation(NOW + 0.75, 0, [1.0])
+    calls = {
+        "delayed must .*, got 1699999999.25": lambda: f.step(
+            state, NOW + 1, [None], delayed=[now.replace(t=NOW - 0.75)]
+        ),
+        "got 1700000000.5 after 1700000001": lambda: f.run(
+            start_of(f, t=NOW), [NOW + 1, NOW + 0.5], [np.zeros((2, 1))]
+        ),
+        "at t = 1700000000.75": lambda: f.step(state, NOW + 1, [now]),
+        "at least 1700000000.5": lambda: f.step(state, NOW, [None]),
+        "time 1700000000.5 or later, got 1700000000.25": lambda: f.run(
+            state, [NOW + 0.25], [None]
+        ),
+    }
+    for text, call in calls.items():
+        with pytest.raises(ValueError, match=text):
+            call()
+    assert repr(state) == "GaussianState(t=1700000000.5, 1 agents)"

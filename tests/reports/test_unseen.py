@@ -1,0 +1,201 @@
+"""Sensors that cannot see: NaN where the state cannot be observed.
+
+==================================  ==========================================================
+Report                              Situation
+==================================  ==========================================================
+POMDPPlanners pull 238              a field of view: NaN beyond the range, unscented filter
+edpl-ompl issue 54                  on top of a landmark the likelihood is NaN
+dust issue 178                      an observation that no particle can explain
+own                                 a radar whose prior mean is its own place, extended filter
+own                                 a target at the edge of the range, in every family
+own                                 one of two components cannot be seen by some particles
+==================================  ==========================================================
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+
+from distfilt.filters import (
+    EnsembleFilter,
+    GaussianFilter,
+    MixtureFilter,
+    Observation,
+    ParticleFilter,
+    TransportFilter,
+)
+from distfilt.kalman import QuaternionChart, mekf
+from distfilt.models import Model, constant_velocity, satellite_pose
+from distfilt.sensors import Sensor, bearing, component, distance, range_bearing
+from distfilt.updates.particles import log_likelihood, reweight
+
+WALK = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[0.01 * dt]]))
+RADAR = Sensor(1, lambda x: np.where(np.abs(x) < 5, x, np.nan), [[0.04]])
+PRIOR = ([4.0], [[4.0]])
+MESSAGE = "observations must be predicted to be used"
+Y = np.array([3.1, 2.9, 3.0, 3.2, 2.8])[:, None]
+TIMES = np.arange(1.0, 6.0)
+
+
+def truncated() -> tuple[float, float]:
+    """The posterior on a grid: states out of range contradict each observation."""
+    x = np.linspace(-12.0, 20.0, 6401)
+    density = np.exp(-0.5 * (x - 4) ** 2 / 4)
+    step = np.exp(-0.5 * (np.arange(-200, 201) * 0.005) ** 2 / 0.01)
+    for y in Y[:, 0]:
+        density = np.convolve(density, step / step.sum(), mode="same")
+        density = density * np.exp(-0.5 * (y - x) ** 2 / 0.04) * (np.abs(x) < 5)
+        density /= density.sum()
+    mean = density @ x
+    return mean, density @ (x - mean) ** 2
+
+
+def test_particles_that_cannot_see_contradict() -> None:
+    f = ParticleFilter(WALK, [RADAR], members=20_000)
+    with warnings.catch_warnings(action="error"):
+        run = f.run(f.start(PRIOR, rng=np.random.default_rng(0)), TIMES, [Y])
+    mean, variance = truncated()
+    assert run["mean"].values[-1, 0, 0] == pytest.approx(mean, abs=0.01)
+    assert run["variance"].values[-1, 0, 0] == pytest.approx(variance, rel=0.1)
+    assert not run["unseen"].values.any()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [EnsembleFilter, TransportFilter, GaussianFilter],
+)
+def test_the_others_leave_out_count_and_say_so_once(make: Any) -> None:
+    """Nothing is learned, the record counts each, and one warning comes in the whole run."""
+    option = {"linearization": "unscented"} if make is GaussianFilter else {}
+    f = make(WALK, [RADAR], **option)
+    rng = np.random.default_rng(0)
+    with pytest.warns(RuntimeWarning, match=MESSAGE) as caught:
+        run = f.run(f.start(PRIOR, rng=rng), TIMES, [Y])
+    assert len(caught) == 1
+    assert (run["unseen"].values == 1).all()
+    assert run["mean"].values[-1, 0, 0] == pytest.approx(4.0, abs=0.7)
+    with pytest.warns(RuntimeWarning, match="agent 0 left out one of kind 'sensor'"):
+        state = f.step(f.start(PRIOR, rng=rng), 1.0, [Y[0]])
+    with warnings.catch_warnings(action="error"):
+        again = f.step(state, 2.0, [Y[1]])
+    assert again.unseen.tolist() == [1.0]
+
+
+def test_unscented_leaves_out_the_component_alone() -> None:
+    """The other component acts as if it came alone."""
+    both = Sensor(
+        2,
+        lambda x: np.concatenate([np.where(np.abs(x) < 5, x, np.nan), x**2], -1),
+        np.diag([0.04, 0.5]),
+    )
+    square = Sensor(1, lambda x: x**2, [[0.5]])
+    found = []
+    for sensor, y in ((both, [3.1, 9.0]), (square, [9.0])):
+        f = GaussianFilter(WALK, [sensor], linearization="unscented")
+        with warnings.catch_warnings(action="ignore"):
+            state = f.step(f.start(PRIOR), 1.0, [y])
+        found.append((state.means, state.covariances))
+    for a, b in zip(*found, strict=True):
+        assert np.allclose(a, b, rtol=1e-12)
+
+
+@pytest.mark.parametrize("linearization", ["extended", "unscented"])
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        bearing([0, 1], std=0.05),
+        range_bearing([0, 1], std=[0.1, 0.05]),
+        distance([0, 1], std=0.1),
+    ],
+)
+def test_a_sensor_on_its_target(sensor: Sensor, linearization: Any) -> None:
+    """The extended filter says that it cannot move; the other learns of a distance."""
+    model = constant_velocity(sigma=0.3)
+    f = GaussianFilter(model, [sensor], linearization=linearization)
+    start = f.start((np.zeros(4), np.diag([9.0, 9.0, 0.01, 0.01])))
+    y = sensor.observe([3.0, 4.0, 0.0, 0.0], rng=np.random.default_rng(0))
+    if sensor.kind == "distance" and linearization == "unscented":
+        with warnings.catch_warnings(action="error"):
+            assert f.step(start, 1.0, [y]).unseen is None
+        return
+    with pytest.warns(RuntimeWarning, match=MESSAGE):
+        state = f.step(start, 1.0, [y])
+    assert state.unseen.tolist() == [1.0]
+    assert np.isfinite(state.covariances).all()
+
+
+def test_a_radar_that_starts_on_its_target_counts_thirty() -> None:
+    radar = range_bearing([0, 1], std=(0.1, 0.05))
+    times = np.arange(1.0, 31.0)
+    truth = np.tile([3.0, 4.0, 0.0, 0.0], (30, 1))
+    y = radar.observe(truth, rng=np.random.default_rng(0))
+    f = GaussianFilter(constant_velocity(sigma=0.3), [radar])
+    cov = np.diag([9.0, 9.0, 0.01, 0.01])
+    with pytest.warns(RuntimeWarning, match="singular point") as caught:
+        run = f.run(f.start((np.zeros(4), cov)), times, [y])
+    assert len(caught) == 1 and run["unseen"].values.sum() == 30
+    with warnings.catch_warnings(action="error"):
+        run = f.run(f.start(([0.01, 0, 0, 0], cov)), times, [y])
+    assert np.abs(run["mean"].values[-1, 0, :2] - [3, 4]).max() < 0.5
+
+
+def test_particles_of_two_components_and_none_that_sees() -> None:
+    """A particle contradicts by one component; a component that nobody sees is left out."""
+    predicted = np.array([[0.0, np.nan], [0.5, 0.2], [1.0, 0.4]])
+    logs = np.log(np.full(3, 1 / 3))
+    y = np.array([0.4, 0.3])
+    weights = np.exp(reweight(logs, predicted, y, np.eye(2)))
+    exact = np.exp(-0.5 * ((y - predicted[1:]) ** 2).sum(axis=-1))
+    assert weights[0] == 0
+    assert np.allclose(weights[1:], exact / exact.sum())
+    nobody = predicted * [1, np.nan]
+    assert np.allclose(
+        reweight(logs, nobody, y, np.eye(2)),
+        reweight(logs, predicted[:, :1], y[:1], np.eye(1)),
+    )
+    # Updates of ensembles leave it out for all, as documented.
+    assert np.isfinite(log_likelihood(predicted, y, np.eye(2))).all()
+    f = ParticleFilter(WALK, [Sensor(1, lambda x: x * np.nan, [[1.0]])], members=100)
+    with pytest.warns(RuntimeWarning, match="no particle can see"):
+        state = f.step(f.start(PRIOR, rng=np.random.default_rng(0)), 1.0, [[1.0]])
+    assert state.unseen.tolist() == [1.0]
+
+
+def test_the_gate_of_particles_looks_through_those_that_see() -> None:
+    f = ParticleFilter(WALK, [RADAR], members=4000, gate_probability=0.99)
+    start = f.start(PRIOR, rng=np.random.default_rng(0))
+    assert f.step(start, 1.0, [[3.1]]).rejected.tolist() == [0.0]
+    assert f.step(start, 1.0, [[-30.0]]).rejected.tolist() == [1.0]
+
+
+def test_a_mixture_contradicts_by_component() -> None:
+    f = MixtureFilter(WALK, [RADAR], target_dim=1)
+    state = f.step(f.start(([0.0], [[0.1]])), 1.0, [[0.3]])
+    # P = 0.11 and R = 0.04
+    assert state.mixtures[0].means[0, 0] == pytest.approx(0.3 * 0.11 / 0.15)
+
+
+def test_the_multiplicative_filter_says_so() -> None:
+    x = np.r_[np.zeros(6), [0.3, 0.2, 0.1], [1.0, 0.0, 0.0, 0.0]]
+    sensor = bearing([0, 1], std=0.1)
+    with pytest.warns(RuntimeWarning, match=MESSAGE):
+        mekf(
+            x,
+            0.01 * np.eye(12),
+            np.full((1, 1), 0.5),
+            chart=QuaternionChart(13, 9),
+            model=satellite_pose(rate=0.1, sigma=0.2, step=0.1),
+            sensors=[sensor],
+            times=[0.1],
+        )
+
+
+def test_a_correct_run_is_not_bothered() -> None:
+    f = GaussianFilter(WALK, [[component([0], std=0.1), RADAR]])
+    with warnings.catch_warnings(action="error"):
+        run = f.run(f.start(([1.0], [[0.1]])), None, [Observation(1.0, 0, [1.0], 1)])
+    assert run["unseen"].values.tolist() == [[0.0]]
