@@ -294,7 +294,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         reuse_rng: bool = False,
     ) -> S:
         """Take one step from checked arguments."""
-        # A state of agents with sensors knows its runs from their failures.
+        # `failed` of a SensorState has one entry for each run.
         runs = state.failed.shape if isinstance(state, SensorState) else state.runs
         read = self.read_observations(observations, runs, t)
         matched = match_delayed(cast(Any, self), delayed, state, t) if delayed else ()

@@ -63,9 +63,9 @@ def update(function: F) -> F:
     function : callable
         ``function(ensemble, predicted, observed, noise, *, rng, …)`` for float64 arrays that fit,
         with a noise covariance for each ensemble or one for all. Annotations of its options are
-        checked too, as :mod:`distfilt.validation` describes. In a filter whose runs miss different
-        components, every run has normal draws of its own if they are drawn for all members at
-        once.
+        checked too, as :mod:`distfilt.validation` describes. It should draw normals for all
+        members of all runs in one call, as by ``rng.normal(size=ensemble.shape)``. Otherwise runs
+        that miss different components can get the same draws.
 
     Returns
     -------
@@ -106,6 +106,7 @@ def update(function: F) -> F:
         return cast(Array, call_user(function, **arguments))
 
     checked: Any = validated(function, call=call_checked, annotations=annotations)
+    # A tag, see `has_tag`: it takes a stack of ensembles in one call.
     checked.stacks = True
     return cast(F, checked)
 

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.random import default_rng
 
 from distfilt import network
 from distfilt.filters import (
@@ -107,7 +108,7 @@ def data(
     sensors: list[Sensor | None], runs: tuple[int, ...] = (), seed: int = 0
 ) -> tuple[np.ndarray, list[np.ndarray | None]]:
     """A truth (T, *runs, 2) and the sensors' readings."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     start = PRIOR[0] + rng.standard_normal((*runs, 2)) @ np.linalg.cholesky(PRIOR[1]).T
     truth = simulate(model(), start, TIMES, rng=rng)
     return truth, [None if s is None else s.observe(truth, rng=rng) for s in sensors]
@@ -133,7 +134,7 @@ def make_filter(family: str, agents: int = 5, **options: Any) -> tuple[Any, Any]
     graph = options.pop("graph", network.graphs.path(len(sensors)))
     runs = options.pop("runs", ())
     f = FAMILIES[family](options.pop("model", model()), sensors, graph, **options)
-    return f, f.start(PRIOR, rng=np.random.default_rng(3), runs=runs)
+    return f, f.start(PRIOR, rng=default_rng(3), runs=runs)
 
 
 def values(state: Any) -> dict[str, np.ndarray]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from distfilt import metrics
 from distfilt.filters import FilterError, Observation, final_state
@@ -146,8 +147,8 @@ def test_direction_across_pi(family: str) -> None:
     ]
     f = make_filter(family, sensors=sensors, model=still)[0]
     prior = (np.array([-2.0, 0.0]), 0.04 * np.eye(2))
-    start = f.start(prior, rng=np.random.default_rng(0), runs=(20,))
-    rng = np.random.default_rng(1)
+    start = f.start(prior, rng=default_rng(0), runs=(20,))
+    rng = default_rng(1)
     truth = np.array([-2.0, 0.0]) + 0.02 * rng.standard_normal((20, 2))
     for k in range(10):
         seen = [s.observe(truth, rng=rng) for s in sensors if s is not None]
@@ -171,7 +172,7 @@ def test_time_passes_to_model_and_noise(family: str) -> None:
         return (0.1 + t) * dt * np.eye(2)
 
     f = make_filter(family, sensors=[None], graph=None, model=Model(2, flow, noise))[0]
-    state = f.start(PRIOR, rng=np.random.default_rng(0), t=2.0)
+    state = f.start(PRIOR, rng=default_rng(0), t=2.0)
     state = f.step(state, 2.5, [None])
     state = f.step(state, 3.5, [None])
     assert {c[1:] for c in calls} == {(2.0, 0.5), (2.5, 1.0)}
@@ -196,7 +197,7 @@ def test_late_reading_is_in_time_after_all(family: str) -> None:
     begin = g.step(g.step(begin, 1.0, [None] * 2), 1.5, [[0.1], None])
     a = f.summarize(late)
     b = g.summarize(begin)
-    blind = g.start(PRIOR, rng=np.random.default_rng(3), runs=(40,))
+    blind = g.start(PRIOR, rng=default_rng(3), runs=(40,))
     blind = g.step(g.step(blind, 1.0, [None] * 2), 1.5, [[0.1], None])
     gap = np.abs(a.mean.mean(axis=0) - b.mean.mean(axis=0)).max()
     assert (
@@ -242,7 +243,7 @@ def test_a_late_reading_belongs_to_its_own_time(
     )
     f = FAMILIES[family](walk, [component([0], std=0.1)], None, lag=3)
     prior = (np.zeros(1), np.eye(1))
-    state = f.start(prior, rng=np.random.default_rng(0), runs=(20,), t=origin)
+    state = f.start(prior, rng=default_rng(0), runs=(20,), t=origin)
     for k in (1, 2, 3):
         state = f.step(state, origin + k * dt, [None])
     times = [then.t for then in state.lagged_states] + [state.t]
@@ -307,6 +308,5 @@ def test_bad_run_is_named_and_others_go_on(family: str) -> None:
     assert np.isfinite(run["mean"].values[:, [0, 2]]).all()
     assert np.isfinite(run["mean"].values[0]).all()
     recorded = [value.values for value in run.values() if "run" in value.dims]
-    assert len(recorded) >= 6 and all(
-        np.isnan(value[1:, 1]).all() for value in recorded
-    )
+    assert len(recorded) >= 6
+    assert all(np.isnan(value[1:, 1]).all() for value in recorded)

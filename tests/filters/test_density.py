@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from distfilt import density
 from distfilt.filters import DensityFilter, DensityState
@@ -16,10 +17,8 @@ H = 0.12
 GRID = density.Grid((10, 10))
 SWARM = rotating_swarm("gibbs")
 MODEL = density.FokkerPlanck(SWARM, GRID)
-START = np.random.default_rng(1).random((SIZE, 2))
-PATH = SWARM.simulate(
-    START, np.arange(1, 9) * 0.1, rng=np.random.default_rng(2), substeps=2
-)
+START = default_rng(1).random((SIZE, 2))
+PATH = SWARM.simulate(START, np.arange(1, 9) * 0.1, rng=default_rng(2), substeps=2)
 
 
 def make(graph: object, rule: object, **options: object) -> DensityFilter:
@@ -89,7 +88,8 @@ def test_flooding_knows_where_agents_were_as_many_steps_ago_as_hops() -> None:
     for j in range(8):
         assert table[j, 2] == pytest.approx(0.8 - 0.1 * max(j - 1, 0))
         assert np.array_equal(table[j, :2], PATH[7 - max(j - 1, 0)][j])
-    assert (table[9:, 2] < 0).all() and state.positions_sent[0] == 9
+    assert (table[9:, 2] < 0).all()
+    assert state.positions_sent[0] == 9
     x = np.stack([PATH[7 - max(j - 1, 0)][j] for j in range(9)])
     assert (
         np.abs(state.observed[0] - density.kernel_density(x, GRID, bandwidth=H)).max()
@@ -103,11 +103,9 @@ def test_flooding_forgets() -> None:
     all_ = graphs.complete(SIZE)
     memory = last(make(all_, density.Flooding(), local=(0,)), path)
     gone = last(make(all_, density.Flooding(forget=0.35), local=(0,)), path, t=-9.0)
-    assert (
-        memory.positions_sent[0] == SIZE - 1
-        and gone.positions_sent[0] == SIZE - 2
-        and gone.positions_sent[4] == 0
-    )
+    assert memory.positions_sent[0] == SIZE - 1
+    assert gone.positions_sent[0] == SIZE - 2
+    assert gone.positions_sent[4] == 0
 
 
 def test_ledger_charges_what_each_rule_sends() -> None:
@@ -131,7 +129,8 @@ def test_agents_that_go_are_left_out_and_their_filters_go_on() -> None:
     present = [i for i in range(SIZE) if i != 5]
     want = density.kernel_density(path[-1][present], GRID, bandwidth=H)
     assert np.abs(state.observed[0] - want).max() < 1e-13
-    assert state.parts == 1 and np.isfinite(state.estimates).all()
+    assert state.parts == 1
+    assert np.isfinite(state.estimates).all()
     assert np.trace(state.filters.information[5]) < np.trace(
         state.filters.information[4]
     )
@@ -158,11 +157,11 @@ def test_a_network_that_falls_apart_is_in_the_ledger() -> None:
         f = make(graph, rule)
         run = f.run(f.start(START), np.arange(1, 9) * 0.1, PATH.swapaxes(0, 1))
         sent = run["messages"].sum("agent").values
-        assert (sent[:4] > 0).all() and (sent[4:] == 0).all()
+        assert (sent[:4] > 0).all()
+        assert (sent[4:] == 0).all()
         assert run["parts"].isel(agent=0).values.tolist() == [1] * 4 + [SIZE] * 4
-        assert np.isfinite(run["mean"].values).all() and np.allclose(
-            run["mass"].values, 1
-        )
+        assert np.isfinite(run["mean"].values).all()
+        assert np.allclose(run["mass"].values, 1)
 
 
 def test_the_sum_forgets_agents_that_drop_out() -> None:

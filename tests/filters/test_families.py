@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from distfilt import filters
 from distfilt.kalman import rts_smoother
@@ -96,9 +97,7 @@ def test_jitter_moves_copies_by_a_share_of_what_is_believed() -> None:
     f = filters.ParticleFilter(
         STILL, [eye], members=4000, ess_threshold=1.0, jitter=0.3
     )
-    before = f.step(
-        f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0)), 1.0, [[1.0]]
-    )
+    before = f.step(f.start(([0.0], [[4.0]]), rng=default_rng(0)), 1.0, [[1.0]])
     after = f.step(before, 2.0, [None]).particles[0, :, 0]
     old = before.particles[0, :, 0]
     stayed = np.isin(after, old)
@@ -109,7 +108,8 @@ def test_jitter_moves_copies_by_a_share_of_what_is_believed() -> None:
     picked = plain.step(before, 2.0, [None]).particles[0, :, 0]
     moves = (after - picked)[~stayed]
     width = 0.3 * np.sqrt(f.summarize(before).variance[0, 0])
-    assert abs(moves.std() / width - 1) < 0.05 and not (after - picked)[stayed].any()
+    assert abs(moves.std() / width - 1) < 0.05
+    assert not (after - picked)[stayed].any()
 
 
 def test_a_member_that_was_picked_or_moved_sees_changes_from_where_it_comes() -> None:
@@ -125,17 +125,16 @@ def test_a_member_that_was_picked_or_moved_sees_changes_from_where_it_comes() ->
     )
     first = filters.Observation(1.0, 0, [0.5])
     still = filters.Observation(2.0, 0, [0.0], 1)
-    start = f.start(np.linspace(-1, 1, 50)[:, None], rng=np.random.default_rng(0))
+    start = f.start(np.linspace(-1, 1, 50)[:, None], rng=default_rng(0))
     state = f.step(start, 1.0, [first, filters.Observation(1.0, 1, [0.5])])
     after = f.step(state, 2.0, [still, None])
-    assert np.ptp(state.weights[0]) > 0.01 and np.ptp(after.weights) < 1e-15
-    assert (state.particles[0] == state.particles[1]).all() and (
-        after.particles[0] != after.particles[1]
-    ).any()
+    assert np.ptp(state.weights[0]) > 0.01
+    assert np.ptp(after.weights) < 1e-15
+    assert (state.particles[0] == state.particles[1]).all()
+    assert (after.particles[0] != after.particles[1]).any()
     lagged = replace(f, ess_threshold=0.2).step(state, 2.0, [None] * 2)
-    assert (lagged.particles == state.particles).all() and (
-        lagged.weights == state.weights
-    ).all()
+    assert (lagged.particles == state.particles).all()
+    assert (lagged.weights == state.weights).all()
     subset = f.step(start, 1.0, [first, None])
     few = replace(f, ess_threshold=0.9)
     repeated = [
@@ -144,7 +143,7 @@ def test_a_member_that_was_picked_or_moved_sees_changes_from_where_it_comes() ->
     assert (repeated[0] == repeated[1]).all()
     assert (repeated[0] != start.particles).any(axis=(1, 2)).tolist() == [True, False]
     g = filters.EnsembleFilter(STILL, eyes, members=50, lag=1)
-    state = g.step(g.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [None])
+    state = g.step(g.start(([0.0], [[1.0]]), rng=default_rng(0)), 1.0, [None])
     delayed, not_told = (
         g.step(state, 2.0, [y], delayed=[first]).ensembles for y in ([still], None)
     )
@@ -176,13 +175,12 @@ def test_particles_tend_to_the_kalman_filter_with_a_full_noise() -> None:
     _, (seen,) = data([BOTH])
     seen[3, 0] = np.nan
     f = filters.ParticleFilter(model(), [BOTH], members=40_000)
-    run = f.run(f.start(PRIOR, rng=np.random.default_rng(0)), TIMES, [seen])
+    run = f.run(f.start(PRIOR, rng=default_rng(0)), TIMES, [seen])
     exact, _ = kalman([seen], [BOTH])
     assert np.allclose(run["mean"].values[:, 0], exact.means, atol=0.03)
     assert np.allclose(run["covariance"].values[:, 0], exact.covariances, atol=0.03)
-    assert (run["effective_size"].values > 1000).all() and (
-        run["distinct"].values > 0.03
-    ).all()
+    assert (run["effective_size"].values > 1000).all()
+    assert (run["distinct"].values > 0.03).all()
 
 
 def test_copies_are_regularised_by_default_where_the_model_never_parts_them() -> None:
@@ -190,7 +188,7 @@ def test_copies_are_regularised_by_default_where_the_model_never_parts_them() ->
     f = filters.ParticleFilter(STILL, [component([0], std=0.5)], members=4000)
     seen = [np.full((6, 1), 0.8)]
     run = f.run(
-        f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0)),
+        f.start(([0.0], [[4.0]]), rng=default_rng(0)),
         np.arange(1.0, 7.0),
         seen,
     )
@@ -203,7 +201,7 @@ def test_copies_are_regularised_by_default_where_the_model_never_parts_them() ->
     f = filters.ParticleFilter(
         half, [component([0], std=0.5)], members=60, ess_threshold=1.0
     )
-    first = f.step(f.start(PRIOR, rng=np.random.default_rng(0)), 1.0, [[0.8]])
+    first = f.step(f.start(PRIOR, rng=default_rng(0)), 1.0, [[0.8]])
     assert np.isin(
         f.step(first, 2.0, [None]).particles[..., 1], first.particles[..., 1]
     ).all()
@@ -217,13 +215,14 @@ def test_one_weight_for_all_warns_although_the_particles_are_distinct(
     f = filters.ParticleFilter(
         STILL, [component([0], std=1e-4)], members=800, jitter=jitter
     )
-    start = f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0))
+    start = f.start(([0.0], [[4.0]]), rng=default_rng(0))
     with pytest.warns(
         filters.ParticleCollapse, match=r"t = 1 s: an agent's .* size of 1\.\d;"
     ):
         state = f.step(start, 1.0, [[0.5]])
     summary = f.summarize(state)
-    assert summary.numbers["distinct"] == 1.0 and summary.numbers["effective_size"] < 2
+    assert summary.numbers["distinct"] == 1.0
+    assert summary.numbers["effective_size"] < 2
     caught = pytest.warns(
         filters.ParticleCollapse, match=r"t = 2 s: 0\.\d+% of an agent's particles"
     )
@@ -236,13 +235,13 @@ def test_one_weight_for_all_warns_although_the_particles_are_distinct(
 
 def test_copies_of_one_particle_warn_at_any_number_and_two_do_not() -> None:
     f = filters.ParticleFilter(STILL, [None], members=50, jitter=0.0)
-    start = f.start(([0.0], [[0.0]]), rng=np.random.default_rng(0))
+    start = f.start(([0.0], [[0.0]]), rng=default_rng(0))
     with pytest.warns(
         filters.ParticleCollapse, match="2.00% of an agent's particles are distinct"
     ):
         f.step(start, 1.0, [None])
     f.step(
-        f.start(np.arange(50.0)[:, None] // 25, rng=np.random.default_rng(0)),
+        f.start(np.arange(50.0)[:, None] // 25, rng=default_rng(0)),
         1.0,
         [None],
     )
@@ -260,12 +259,10 @@ def test_what_an_agreement_moves_was_there_before_too() -> None:
         share_observations=False,
         fusion=partial(mean_pull, gain=0.3),
     )
-    start = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
+    start = f.start(([0.0], [[1.0]]), rng=default_rng(0))
     after = f.step(f.step(start, 1.0, [[0.5], None]), 2.0, [[0.7], None])
-    assert (
-        np.allclose(after.history[0][1], after.particles)
-        and (after.particles != start.particles).any()
-    )
+    assert np.allclose(after.history[0][1], after.particles)
+    assert (after.particles != start.particles).any()
 
 
 def test_a_run_whose_covariance_overflows_leaves_the_others_to_agree() -> None:
@@ -279,9 +276,8 @@ def test_a_run_whose_covariance_overflows_leaves_the_others_to_agree() -> None:
     )
     with np.errstate(over="ignore", invalid="ignore"):
         state = f.step(f.start(([0.0], [[1.0]]), runs=(2,)), 1.0, [None, None])
-    assert state.failed.tolist() == [False, True] and np.allclose(
-        state.covariances[0], 2.0
-    )
+    assert state.failed.tolist() == [False, True]
+    assert np.allclose(state.covariances[0], 2.0)
 
 
 def test_an_agreement_for_one_run_is_asked_for_each() -> None:
@@ -323,7 +319,7 @@ def test_a_run_whose_agreement_fails_leaves_the_others_as_they_are() -> None:
         on_error="keep",
         faults=Faults(loss=0.5, seed=3),
     )
-    start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(3,))
+    start = f.start(PRIOR, rng=default_rng(0), runs=(3,))
     wild = start.replace(
         ensembles=start.ensembles + 99 * np.eye(3)[1][:, None, None, None]
     )
@@ -333,7 +329,8 @@ def test_a_run_whose_agreement_fails_leaves_the_others_as_they_are() -> None:
         start, wild = (f.step(s, t, [None] * 4) for s in (start, wild))
         assert wild.failed.tolist() == [False, True, False]
         np.testing.assert_array_equal(wild.ensembles[[0, 2]], start.ensembles[[0, 2]])
-        assert (wild.ledger.lost == start.ledger.lost).all() and start.ledger.lost.any()
+        assert (wild.ledger.lost == start.ledger.lost).all()
+        assert start.ledger.lost.any()
 
 
 @pytest.mark.filterwarnings("ignore:overflow")
@@ -346,7 +343,7 @@ def test_a_reading_that_no_particle_explains_ends_its_run_alone() -> None:
         share_observations=False,
         on_error="keep",
     )
-    start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(3,))
+    start = f.start(PRIOR, rng=default_rng(0), runs=(3,))
     good = np.zeros((3, 1))
     wild = np.array([[0.0], [0.0], [1e200]])
     a, b = (f.step(start, 0.5, [good, y]) for y in (good, wild))
@@ -377,7 +374,7 @@ def test_a_run_whose_update_fails_is_named_and_leaves_the_others_their_draws(
         members=5,
         on_error="keep",
     )
-    start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(3,))
+    start = f.start(PRIOR, rng=default_rng(0), runs=(3,))
     good = f.step(start, 0.5, [np.zeros((3, 1))] * 2)
     failing = f.step(start, 0.5, [np.zeros((3, 1)), np.array([[0.0], [9.0], [0.0]])])
     assert failing.failed.tolist() == [False, True, False]
@@ -399,7 +396,7 @@ def test_groups_of_readings_give_each_agent_its_own_noise() -> None:
         f = filters.EnsembleFilter(
             model(), eyes, share_observations=False, members=10, update=update
         )
-        start = f.start(PRIOR, rng=np.random.default_rng(0))
+        start = f.start(PRIOR, rng=default_rng(0))
         p, q = (
             f.summarize(s).variance[:, 0]
             for s in (start, f.step(start, 0.0, [[1.0], [1.0]]))
@@ -412,7 +409,7 @@ def test_nees_of_a_collapsed_cloud_is_infinite() -> None:
     # The first reading is 1e6 times sharper than the prior: one particle keeps all the weight.
     walk = Model(2, lambda x, t, dt: x, lambda t, dt: dt * np.eye(2))
     f = filters.ParticleFilter(walk, [component([0, 1], std=1e-6)], members=20)
-    state = f.start((np.zeros(2), np.eye(2)), rng=np.random.default_rng(0), runs=(3,))
+    state = f.start((np.zeros(2), np.eye(2)), rng=default_rng(0), runs=(3,))
     truth = np.full((2, 3, 2), 0.3)
     seen = truth.copy()
     seen[:, 1] = np.nan  # a run without readings stays honest

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from scipy.linalg import block_diag
 from scipy.stats import norm
 
@@ -65,7 +66,7 @@ def joint(agents: int, readings: np.ndarray, speed: np.ndarray) -> tuple:
 def test_news_are_one_filter_with_everybodys_readings(
     agents: int, exchange_interval: float | None
 ) -> None:
-    rng = np.random.default_rng(agents)
+    rng = default_rng(agents)
     readings = rng.standard_normal((4, agents))
     readings[1, 0] = np.nan
     speed = np.array([0.1, 0.3, np.nan, -0.2])
@@ -101,7 +102,7 @@ def test_what_all_receive_counts_twice_if_it_is_told() -> None:
 
 @pytest.mark.parametrize("rank", range(1, 5))
 def test_an_increment_is_the_readings_that_taught_it(rank: int) -> None:
-    rng = np.random.default_rng(rank)
+    rng = default_rng(rank)
     root = rng.standard_normal((4, 4))
     before = GaussianMixture.gaussian(rng.standard_normal(4), root @ root.T)
     h = rng.standard_normal((rank, 4))
@@ -149,7 +150,8 @@ def test_news_that_are_lost_leave_the_own_belief() -> None:
     )
     a, b = (f.step(f.start([PRIOR] * 2), 1.0, seen) for f in (deaf, single))
     for x, y in zip(a.mixtures, b.mixtures, strict=True):
-        assert np.allclose(x.covs, y.covs) and np.allclose(x.means, y.means)
+        assert np.allclose(x.covs, y.covs)
+        assert np.allclose(x.means, y.means)
     assert a.ledger.lost.sum() == 2
 
 
@@ -220,7 +222,7 @@ def test_a_target_that_moves_with_noise_needs_readings_in_place_of_news(
     q: float, claimed: float, least: float
 ) -> None:
     """Two agents with fixed doubtful places, ten readings each, on a line."""
-    readings = np.random.default_rng(1).standard_normal((10, 2))
+    readings = default_rng(1).standard_normal((10, 2))
     ego = Model(2, lambda x, t, dt: x, lambda t, dt: np.diag([q, 0.0]))
     single = Sensor(1, lambda x: x[..., :1] - x[..., 1:], np.array([[0.3]]))
     prior = GaussianMixture.gaussian([0.0, 0.0], np.diag([4.0, 1.0]))
@@ -246,9 +248,8 @@ def test_a_target_that_moves_with_noise_needs_readings_in_place_of_news(
         Q=np.diag([q, 0.0, 0.0]),
         R=0.3 * np.eye(2),
     )
-    assert (
-        np.allclose(joint.means, exact.means[-1]) and joint.ledger.scalars.sum() == 20
-    )
+    assert np.allclose(joint.means, exact.means[-1])
+    assert joint.ledger.scalars.sum() == 20
     assert np.allclose(joint.covariances, exact.covariances[-1])
     variances = one.mixtures[0].covs[0, 0, 0], joint.covariances[0, 0, 0]
     assert np.allclose(variances, (claimed, least), atol=1e-3)

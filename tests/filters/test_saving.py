@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from distfilt.filters import State
 from distfilt.filters.ensemble import EnsembleState
@@ -45,7 +46,8 @@ def test_everything_comes_back(tmp_path: Path, kind: str) -> None:
     after = EveryField.load(tmp_path / "a.npz")
     loaded = (after.t, after.size, after.word, after.nothing, after.yes)
     assert loaded == (1.5, 7, "a b", None, True)
-    assert after.counts.dtype == np.int32 and after.counts.tolist() == [1, 2]
+    assert after.counts.dtype == np.int32
+    assert after.counts.tolist() == [1, 2]
     assert [t for t, _ in after.nested] == [0.1, 0.2]
     for (_, a), (_, b) in zip(before.nested, after.nested, strict=True):
         assert a.tobytes() == b.tobytes()
@@ -67,8 +69,9 @@ def test_a_failed_save_leaves_the_earlier_file(
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match=r"no space left: .*a\.npz"):
-        make_state(np.random.default_rng(0)).save(path)
-    assert path.read_bytes() == before and os.listdir(tmp_path) == ["a.npz"]
+        make_state(default_rng(0)).save(path)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["a.npz"]
 
 
 def test_a_twin_with_the_same_fields_is_another_kind(tmp_path: Path) -> None:
@@ -76,7 +79,7 @@ def test_a_twin_with_the_same_fields_is_another_kind(tmp_path: Path) -> None:
         pass
 
     for made, asked in ((Twin, EnsembleState), (EnsembleState, Twin)):
-        made(0.0, Ledger.empty(1), np.random.default_rng(0), np.zeros((1, 2, 1))).save(
+        made(0.0, Ledger.empty(1), default_rng(0), np.zeros((1, 2, 1))).save(
             tmp_path / "a.npz"
         )
         assert made.load(tmp_path / "a.npz").ensembles.shape == (1, 2, 1)
@@ -87,9 +90,9 @@ def test_a_twin_with_the_same_fields_is_another_kind(tmp_path: Path) -> None:
 def test_damage_is_found_at_every_byte(tmp_path: Path) -> None:
     """Neither a flipped bit nor a cut gives a state: the file is refused by name."""
     path = tmp_path / "a.npz"
-    make_state(np.random.default_rng(3)).save(path)
+    make_state(default_rng(3)).save(path)
     content = path.read_bytes()
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     for place in rng.choice(len(content), 400, replace=False):
         bad = bytearray(content)
         bad[place] ^= 1 << int(rng.integers(8))

@@ -11,6 +11,7 @@ import numpy as np
 import pandas
 import pytest
 import xarray
+from numpy.random import default_rng
 from scipy.stats import chi2, multivariate_normal, norm
 
 from distfilt import filters
@@ -37,7 +38,7 @@ EYES = [
 ]
 NET = graphs.complete(3)
 SWARM = rotating_swarm("gibbs")
-PLACES = np.random.default_rng(1).random((9, 2))
+PLACES = default_rng(1).random((9, 2))
 LAW = FokkerPlanck(SWARM, Grid((9, 9)))
 SIX = {
     "ensemble": partial(filters.EnsembleFilter.exact, members=30, fusion=None),
@@ -58,7 +59,7 @@ def make_filter(
 ) -> tuple[Any, Any, Any, Any]:
     """A filter, its first state, the readings agent by agent, and the truth."""
     if family == "density":
-        path = SWARM.simulate(PLACES, times, rng=np.random.default_rng(2), substeps=2)
+        path = SWARM.simulate(PLACES, times, rng=default_rng(2), substeps=2)
         arguments = {"fusion": Flooding(), "bandwidth": 0.15, "rank": 20} | options
         f: Any = filters.DensityFilter(LAW, 9, arguments.pop("graph", 0.5), **arguments)
         return f, f.start(PLACES), path.swapaxes(0, 1), LAW.evolve(np.ones(81), times)
@@ -68,7 +69,7 @@ def make_filter(
         model(), arguments.pop("sensors"), arguments.pop("graph"), **arguments
     )
     seen = [None if s is None else s[: len(times)] for s in seen]
-    return f, f.start(PRIOR, rng=np.random.default_rng(0)), seen, truth[: len(times)]
+    return f, f.start(PRIOR, rng=default_rng(0)), seen, truth[: len(times)]
 
 
 @EACH
@@ -107,7 +108,8 @@ def test_a_run_is_its_steps_whether_saved_or_not(family: str, tmp_path: Path) ->
     assert (
         run["squared_error"].values == (run["mean"].values - truth[:, None]) ** 2
     ).all()
-    assert len(repr(state)) < 200 and f"t={times[-1]:g}" in repr(state)
+    assert len(repr(state)) < 200
+    assert f"t={times[-1]:g}" in repr(state)
 
 
 @OF_SIX
@@ -117,7 +119,7 @@ def test_events_of_any_order_are_the_series(family: str) -> None:
         (a, *pair) for a, s in enumerate(seen) for pair in zip(TIMES, s, strict=True)
     ]
     events = [filters.Observation(t, a, y) for a, t, y in pairs]
-    mixed = [events[k] for k in np.random.default_rng(0).permutation(len(events))]
+    mixed = [events[k] for k in default_rng(0).permutation(len(events))]
     a = f.run(start, TIMES, seen)
     b = f.run(start, None, mixed)
     xarray.testing.assert_equal(a, b)
@@ -169,9 +171,7 @@ def test_units_change_nothing(family: str) -> None:
     g = SIX[family](wide, eyes, NET)
     first = (big * PRIOR[0], big**2 * PRIOR[1])
     a = f.run(start, TIMES, seen)
-    b = g.run(
-        g.start(first, rng=np.random.default_rng(0)), TIMES, [big * s for s in seen]
-    )
+    b = g.run(g.start(first, rng=default_rng(0)), TIMES, [big * s for s in seen])
     assert np.allclose(big * a["mean"], b["mean"], rtol=1e-6, atol=1e-6 * big)
     assert np.allclose(big * a["spread"], b["spread"], rtol=1e-6)
 
@@ -179,7 +179,7 @@ def test_units_change_nothing(family: str) -> None:
 @pytest.mark.parametrize("family", ["gaussian", "mixture", "news", "density"])
 def test_the_order_of_agents_changes_nothing(family: str) -> None:
     f, start, seen, _ = make_filter(family)
-    order = np.random.default_rng(4).permutation(len(seen))
+    order = default_rng(4).permutation(len(seen))
     if family == "density":
         g = f
         begin = f.start(PLACES[order])
@@ -223,9 +223,7 @@ def test_the_gate_lets_pass_what_its_share_says(family: str) -> None:
         family,
         **arguments | ({"linearization": "unscented"} if family == "gaussian" else {}),
     )[0]
-    start = f.start(
-        (np.array([9.0, 0.0]), 0.2 * np.eye(2)), rng=np.random.default_rng(0)
-    )
+    start = f.start((np.array([9.0, 0.0]), 0.2 * np.eye(2)), rng=default_rng(0))
     assert f.step(start, 0.01, [[np.pi], None, None]).rejected[0] == 1
 
 
@@ -237,7 +235,8 @@ def test_each_reading_is_judged_alone() -> None:
     wild = [0.8, 40.0]
     a = f.step(start, 0.1, [good, wild, None])
     b = plain.step(start, 0.1, [good, None, None])
-    assert a.rejected.tolist() == [1, 1, 1] and np.array_equal(a.means, b.means)
+    assert a.rejected.tolist() == [1, 1, 1]
+    assert np.array_equal(a.means, b.means)
     run = f.run(start, [0.1], [[good], [wild], None])
     assert run["rejected"].values.tolist() == [[1, 1, 1]]
     f, start, _, _ = make_filter("gaussian", gate_probability=0.999, lag=1)
@@ -315,7 +314,8 @@ def test_what_was_heard_is_not_told_as_one_s_own() -> None:
 def test_what_waits_survives_on_disk_and_a_lag_has_to_reach_it(tmp_path: Path) -> None:
     f, start, seen, _ = make_filter("gaussian", exchange_interval=1.0, lag=8)
     states = list(f.steps(start, TIMES, seen))
-    assert states[0].pending and not states[3].pending
+    assert states[0].pending
+    assert not states[3].pending
     states[1].save(tmp_path / "s.npz")
     for s in seen:
         s[:2] = 9.0  # a buffer that is filled again does not change the pending values
@@ -363,7 +363,8 @@ def test_a_selection_has_no_wrong_state(family: str) -> None:
     run = f.run(start, TIMES, seen)
     last = final_state(run)
     assert last.t == TIMES[-1]
-    assert final_state(run.copy()) is last and final_state(run.assign(x=1)) is last
+    assert final_state(run.copy()) is last
+    assert final_state(run.assign(x=1)) is last
     assert np.array_equal(
         f.summarize(final_state(run.copy(deep=True))).mean, f.summarize(last).mean
     )
@@ -386,7 +387,7 @@ def test_a_state_and_a_reading_of_another_are_refused() -> None:
     with pytest.raises(ValueError, match="state must have sizes"):
         g.step(
             filters.EnsembleFilter(model(), EYES, NET, members=7).start(
-                PRIOR, rng=np.random.default_rng(0)
+                PRIOR, rng=default_rng(0)
             ),
             0.1,
             [None] * 3,
@@ -405,12 +406,11 @@ def test_a_prior_of_any_kind() -> None:
     f, _, _, _ = make_filter("gaussian")
     frozen = multivariate_normal(*PRIOR)
     mixture = GaussianMixture.gaussian(*PRIOR)
-    members = frozen.rvs(size=50, random_state=np.random.default_rng(0))
+    members = frozen.rvs(size=50, random_state=default_rng(0))
     for prior in (PRIOR, [*PRIOR], frozen, mixture):
         state = f.start(prior)
-        assert np.allclose(state.means, PRIOR[0]) and np.allclose(
-            state.covariances, PRIOR[1]
-        )
+        assert np.allclose(state.means, PRIOR[0])
+        assert np.allclose(state.covariances, PRIOR[1])
     assert np.allclose(f.start(members).covariances, np.cov(members.T))
     flat = (PRIOR[0], np.diag([1.0, 0.0]))
     unscented = filters.GaussianFilter(model(), EYES, NET, linearization="unscented")
@@ -422,7 +422,7 @@ def test_a_prior_of_any_kind() -> None:
     ):
         with pytest.raises(ValueError, match=f"prior must .*{text}"):
             g.start(wrong)
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     e = filters.EnsembleFilter(model(), EYES, NET, members=4000)
     with pytest.raises(
         ValueError, match=r"prior must have shape \(3, 4000, 2\), got \(3, 4000, 3\)"
@@ -431,9 +431,8 @@ def test_a_prior_of_any_kind() -> None:
     two = GaussianMixture([0.5, 0.5], [[-3.0, 0.0], [3.0, 0.0]], [np.eye(2)] * 2)
     for prior, cov in ((PRIOR, PRIOR[1]), (frozen, PRIOR[1]), (two, two.cov)):
         x = e.start(prior, rng=rng, runs=(2,)).ensembles
-        assert x.shape == (2, 3, 4000, 2) and np.allclose(
-            np.cov(x[1, 2].T), cov, atol=0.5
-        )
+        assert x.shape == (2, 3, 4000, 2)
+        assert np.allclose(np.cov(x[1, 2].T), cov, atol=0.5)
     m = filters.MixtureFilter(model(), EYES, target_dim=2)
     begun = m.start([PRIOR, frozen, two]).mixtures
     assert [b.n_components for b in begun] == [1, 1, 2]
@@ -497,4 +496,5 @@ def test_inflation_widens_the_forecast_and_goes_with_fusion_and_the_past() -> No
         (p - unfused)[..., 2:, 2:], gain @ (p - unfused)[..., :2, :2] @ gain.mT
     )
     assert np.allclose(shift[..., 2:, None], gain @ shift[..., :2, None])
-    assert np.allclose(c.means, fused[0]) and np.allclose(c.covariances, fused[1])
+    assert np.allclose(c.means, fused[0])
+    assert np.allclose(c.covariances, fused[1])

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from distfilt.coupling import transform_ensemble
 from distfilt.coupling.transform import transport_plans
@@ -35,7 +36,7 @@ def _filter(**options: Any) -> TransportFilter:
 
 
 def _start(f: TransportFilter, runs: tuple[int, ...] = ()) -> EnsembleState:
-    return f.start(PRIOR, rng=np.random.default_rng(2), runs=runs)
+    return f.start(PRIOR, rng=default_rng(2), runs=runs)
 
 
 def _central(state: EnsembleState, seen: list[Any], steps: int) -> np.ndarray:
@@ -76,7 +77,8 @@ def test_only_log_likelihoods_are_sent() -> None:
     f = _filter()
     _, seen = data(FOUR)
     ledger = f.step(_start(f), TIMES[0], [o[0] for o in seen]).ledger
-    assert ledger.rounds == 2 and (ledger.scalars == 2 * 2 * 30).all()
+    assert ledger.rounds == 2
+    assert (ledger.scalars == 2 * 2 * 30).all()
 
 
 def test_an_agent_whom_nobody_hears_counts_its_own_reading_once() -> None:
@@ -137,7 +139,7 @@ def test_weights_of_a_run_that_failed_are_no_collapse(
     f = TransportFilter(
         model(), [component([0], std=0.6)], None, members=30, on_error="keep"
     )
-    start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(2,))
+    start = f.start(PRIOR, rng=default_rng(0), runs=(2,))
     with pytest.warns(
         ParticleCollapse, match="squared distance from an ensemble's predictions"
     ):

@@ -15,9 +15,11 @@ def samples(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw correlated, shifted, badly scaled samples (y, x)."""
     rng = rng_of(seed)
-    mixing = rng.standard_normal((m + d, m + d)) * np.logspace(-1, 1, m + d)
-    z = rng.standard_normal((*leading, n, m + d)) @ mixing
-    z += 10 * rng.standard_normal(m + d)
+    size = m + d
+    units = np.logspace(-1, 1, size)
+    mixing = rng.standard_normal((size, size)) * units
+    z = rng.standard_normal((*leading, n, size)) @ mixing
+    z += 10 * rng.standard_normal(size)
     return z[..., :m], z[..., m:]
 
 
