@@ -34,7 +34,7 @@ def anomalies(x: np.ndarray) -> np.ndarray:
     return x - x.mean(axis=-2, keepdims=True)
 
 
-def exact_draws(z: np.ndarray, avoid: np.ndarray) -> np.ndarray:
+def exact(z: np.ndarray, avoid: np.ndarray) -> np.ndarray:
     """Normal draws (..., N, k) made uncorrelated with anomalies and of unit sample covariance."""
     # A linear sensor's predictions depend on the members, so that normal equations are singular.
     frame = np.linalg.qr(avoid)[0]
@@ -71,7 +71,7 @@ def plain_step(
 
     def draw(avoid: np.ndarray, k: int) -> np.ndarray:
         z = rng.standard_normal((*avoid.shape[:-1], k))
-        return exact_draws(z, avoid) if kind == "exact" else z
+        return exact(z, avoid) if kind == "exact" else z
 
     def call() -> np.ndarray:
         x = setup.model.step(states, 0.0, dt)

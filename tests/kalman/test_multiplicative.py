@@ -91,7 +91,8 @@ def test_projection_inverts_the_basis_and_ignores_the_quaternion_s_length(
     cov = spd(rng, dim - 1)
     # B P Bᵀ is the covariance of states whose errors have the covariance P.
     basis = chart.tangent_basis(x)
-    assert np.allclose(chart.project(x, basis @ cov @ basis.mT), cov)
+    state_cov = basis @ cov @ basis.mT
+    assert np.allclose(chart.project(x, state_cov), cov)
     # A change of the length along the quaternion is no error.
     along = np.zeros_like(x)
     along[:, first : first + 4] = x[:, first : first + 4]
@@ -106,7 +107,8 @@ def test_a_flat_chart_gives_the_extended_kalman_filter() -> None:
     start = np.array([0.0, 0.0, 1.0, 0.0, 0.2])
     cov = 0.1 * spd(rng, 5)
     sensors = [range_bearing([0, 1], std=[0.1, 0.05], origin=[3.0, 0.1])]
-    y = stack(sensors).observe(start + 0.1 * rng.standard_normal((3, 4, 5)), rng=rng)
+    states = start + 0.1 * rng.standard_normal((3, 4, 5))
+    y = stack(sensors).observe(states, rng=rng)
     y[1, 2, 0] = np.nan
     options = {"model": model, "sensors": sensors, "times": [0.3, 0.8, 1.8]}
     result = mekf(start, cov, y, chart=_FlatChart(5, 0), **options)
@@ -179,6 +181,7 @@ def test_errors_are_propagated_by_the_derivative_of_the_transition_in_the_chart(
     noise_part = POSE.tangent_basis(forecast)[[9, 11]]
     c = np.hstack([central_difference(change, zero), noise_part])
     innovation_cov = c @ joint @ c.T + 0.09 * np.eye(2)
+    # Cov(end error | y) = (A - K C) P Aᵀ with K = A P Cᵀ S⁻¹
     gain = np.linalg.solve(innovation_cov, c @ joint @ a.T).T
     expected = (a - gain @ c) @ joint @ a.T
     assert np.allclose(run.covariances[0], expected, atol=1e-6)
@@ -223,7 +226,8 @@ def test_sensors_of_increments_equal_the_kalman_filter_of_a_doubled_state() -> N
         R=np.diag([0.04, 0.04, 0.09]),
     )
     means = expected.means[..., :d]
-    covs = np.broadcast_to(expected.covariances[..., :d, :d], run.covariances.shape)
+    expected_covs = expected.covariances[..., :d, :d]
+    covs = np.broadcast_to(expected_covs, run.covariances.shape)
     np.testing.assert_allclose(run.means, means, rtol=0, atol=1e-8)
     np.testing.assert_allclose(run.covariances, covs, rtol=0, atol=1e-8)
     np.testing.assert_allclose(
@@ -250,8 +254,8 @@ def test_the_uncertainty_of_an_attitude_is_consistent_and_its_length_conserved()
     run = mekf(x0, cov, y, chart=POSE, model=model, sensors=sensors, times=times)
     # eᵀ P⁻¹ e, summed over the runs, is χ² distributed with 12 degrees of freedom each.
     error = POSE.local(run.means[-1], states[-1])
-    whitened = np.linalg.solve(run.covariances[-1], error[..., None])[..., 0]
-    nees = (error * whitened).sum()
+    whitened = np.linalg.solve(run.covariances[-1], error[..., None])
+    nees = (error * whitened[..., 0]).sum()
     low, high = chi2.ppf([5e-4, 1 - 5e-4], 12 * runs)
     assert low < nees < high
     lengths = np.linalg.norm(run.means[..., 9:], axis=-1)

@@ -43,7 +43,8 @@ def test_a_missing_component_is_a_deleted_row() -> None:
     h = np.column_stack([x @ H.T, x[:, 0]])
     y = np.array([1.2, -0.7, 0.4])
     rows = [0, 2]
-    expected = ETKF(x, h[:, rows], y[rows], noise[np.ix_(rows, rows)], rng=rng())
+    block = noise[np.ix_(rows, rows)]
+    expected = ETKF(x, h[:, rows], y[rows], block, rng=rng())
     without_value = y.copy()
     without_value[1] = np.nan
     analysis = updates.with_missing(ETKF, x, h, without_value, noise, rng=rng())
@@ -137,7 +138,9 @@ def test_serial_updates_without_a_sensor_are_exact_for_linear_observations() -> 
     x = members(20, 2)
     diagonal = np.diag([0.5, 0.9])
     update = updates.serially(updates.enkf_exact)
-    for noise in (np.stack([diagonal, 2 * diagonal]), np.stack([diagonal, R])):
+    independent = np.stack([diagonal, 2 * diagonal])
+    correlated = np.stack([diagonal, R])
+    for noise in (independent, correlated):
         analysis = update(x, x @ H.T, [Y, Y], noise, rng=rng())
         for k in range(2):
             mean, cov = kalman(*moments(x[k]), H, noise[k], Y)
@@ -160,7 +163,8 @@ def test_serial_updates_predict_again() -> None:
     second = ETKF(first, predict(first)[:, 1:], y[1:], [[0.9]], rng=rng())
     assert np.allclose(analysis, second, atol=1e-13)
     # Predictions that move along with the members differ, since h is not linear.
-    assert np.abs(update(*data, rng=rng()) - analysis).max() > 1e-3
+    without_predict = update(*data, rng=rng())
+    assert np.abs(without_predict - analysis).max() > 1e-3
 
 
 # ------------------------------------------------------------------------------ forecasts
@@ -181,7 +185,8 @@ def test_exact_forecast_adds_q_exactly() -> None:
     forecast = exact_forecast(x, nonlinear, 0.0, 0.5, rng=rng())
     steps = nonlinear.step(x, 0.0, 0.5)
     for k in range(3):
-        assert np.allclose(forecast[k].mean(axis=0), steps[k].mean(axis=0), atol=1e-13)
+        expected = steps[k].mean(axis=0)
+        assert np.allclose(forecast[k].mean(axis=0), expected, atol=1e-13)
         expected = np.cov(steps[k].T) + 0.5 * q
         assert np.allclose(np.cov(forecast[k].T), expected, atol=1e-12)
     # A failed ensemble does not change the draws of the others.
@@ -244,7 +249,8 @@ def test_augmentation_is_one_more_observation(update: Update) -> None:
     """|q|² is observed as L² = 1.44 with independent noise of the given deviation."""
     x = swings()
     positions = x[:, :2]
-    predicted = np.column_stack([positions, (positions**2).sum(axis=1)])
+    squares = (positions**2).sum(axis=1)
+    predicted = np.column_stack([positions, squares])
     noise = np.zeros((3, 3))
     noise[:2, :2] = NOISE
     noise[2, 2] = 0.2**2
@@ -265,13 +271,16 @@ def test_the_taper_is_a_correlation_that_ends_at_two_radii() -> None:
     step = 1e-3
     for joint, power in ((1.0, 1), (2.0, 3)):
         centre = gaspari_cohn(np.array(joint))
-        before, after = gaspari_cohn(joint + np.array([-step, step])) - centre
+        sides = joint + np.array([-step, step])
+        before, after = gaspari_cohn(sides) - centre
         assert abs(before + after) < step**power
     points = np.arange(40.0)
     on_line = np.abs(np.subtract.outer(points, points))
     on_ring = np.minimum(on_line, 40 - on_line)
+    # A correlation matrix is positive semidefinite.
     for distance in (on_line, on_ring):
-        assert np.linalg.eigvalsh(gaspari_cohn(distance / 5)).min() > -1e-12
+        taper = gaspari_cohn(distance / 5)
+        assert np.linalg.eigvalsh(taper).min() > -1e-12
 
 
 def test_a_single_observation_is_localised_by_a_tapered_gain() -> None:
@@ -280,9 +289,11 @@ def test_a_single_observation_is_localised_by_a_tapered_gain() -> None:
     places = np.array([[0.0], [1.5], [7.0]])
     observation_places = np.array([[0.5]])
     zeta = np.sqrt(0.5) * rng(3).standard_normal((20, 1))
-    rho = gaspari_cohn(np.abs(places - observation_places)[:, 0] / 2)
+    distances = np.abs(places - observation_places)[:, 0]
+    rho = gaspari_cohn(distances / 2)
     covariance = np.cov(x.T)
-    gain = rho * covariance[:, 0] / (covariance[0, 0] + 0.5)
+    innovation_variance = covariance[0, 0] + 0.5
+    gain = rho * covariance[:, 0] / innovation_variance
 
     def update_with_seed(*data: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         return updates.enkf(*data, rng=np.random.default_rng(3))
@@ -294,7 +305,8 @@ def test_a_single_observation_is_localised_by_a_tapered_gain() -> None:
         radius=2.0,
     )
     analysis = local(x, x[:, :1], [1.0], [[0.5]], rng=rng())
-    expected = x + (1.0 - x[:, :1] - zeta) * gain
+    innovations = 1.0 - x[:, :1] - zeta
+    expected = x + innovations * gain
     assert np.allclose(analysis, expected, atol=1e-12)
     # The third component is farther than two radii.
     assert (analysis[:, 2] == x[:, 2]).all()
