@@ -16,7 +16,8 @@ def test_user_code_passes_a_strict_type_checker(tmp_path: Path) -> None:
     script = tmp_path / "readme.py"
     script.write_text(block, encoding="utf-8")
     examples = sorted(str(path) for path in (ROOT / "book" / "examples").glob("*.py"))
-    # The settings of the repository hold for its own code, so that a user's must be given here.
+    # The settings of the repository hold for its own code, so that a user's must be
+    # given here.
     options = ["--strict", "--config-file", str(ROOT / "pyproject.toml")]
     command = [sys.executable, "-m", "mypy", *options, str(script), *examples]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)

@@ -45,7 +45,8 @@ def test_the_variants_by_their_formulas_in_a_batch(eps: float) -> None:
     }
     for variant, innovation in innovations.items():
         options: Any = {"variant": variant, "regularisation": eps, "safeguard": False}
-        first, second = project(np.stack([0.5 * x, x]), g, **options)
+        batch = np.stack([0.5 * x, x])
+        first, second = project(batch, g, **options)
         expected = x + innovation @ gain.T
         assert np.allclose(second, expected, atol=1e-10)
         # The other ensemble of the batch has a gain of its own.
@@ -90,7 +91,8 @@ def test_the_safeguard_of_the_shift_uses_the_mean_residual() -> None:
 @pytest.mark.parametrize(
     ("function", "value", "x"),
     [
-        # At the bottom of x² the regression's slope is small, and the step to d far too long.
+        # At the bottom of x² the regression's slope is small, and the step to d far too
+        # long.
         (lambda v: v**2, 1.0, [[-0.3], [0.31]]),
         # A long step leaves the domain of the logarithm.
         (lambda v: np.log(np.where(v > 0, v, np.nan)), -20.0, [[0.5], [1.0], [1.5]]),
@@ -149,7 +151,10 @@ def test_velocities_become_tangent_and_keep_their_tangent_part() -> None:
     assert np.abs(first + second).max() < 1e-14
 
     def momentum(states: np.ndarray) -> np.ndarray:
-        return states[:, 0] * states[:, 5] - states[:, 3] * states[:, 1]
+        # q_0 v_1 - q_1 v_0
+        first = states[:, 0] * states[:, 5]
+        second = states[:, 3] * states[:, 1]
+        return first - second
 
     radius = np.hypot(x[:, 0], x[:, 3])
     # q' = q / |q| and v' = v - (q'ᵀv) q': q' × v' = q × v / |q|.
@@ -159,6 +164,7 @@ def test_velocities_become_tangent_and_keep_their_tangent_part() -> None:
     # The parabola q_0² + q_1 = 0 has the tangents 2 q_0 v_0 + v_1 = 0.
     parabola = Constraint(lambda v: v[..., :1] ** 2 + v[..., 1:2], [0.0])
     retracted = retract(x, parabola, motion=([0, 1], [2, 3]))
+    # Its derivative is numerical: 1e-8 in place of rounding.
     normal_velocity = 2 * retracted[:, 0] * retracted[:, 2] + retracted[:, 3]
     assert np.abs(normal_velocity).max() < 1e-8
 
@@ -185,10 +191,17 @@ def test_a_constraint_without_a_solution_does_not_converge(
 
 def test_steps_are_halved_where_newton_overshoots_or_leaves_the_domain() -> None:
     """From 3 a full step for arctan goes to -9.5; from 5 one for log x = -1 goes to -8."""
-    g = Constraint(np.arctan, [0.0], derivative=lambda x: 1 / (1 + x[..., None] ** 2))
+
+    def slope(x: np.ndarray) -> np.ndarray:
+        return 1 / (1 + x[..., None] ** 2)
+
+    def log(x: np.ndarray) -> np.ndarray:
+        return np.log(np.where(x > 0, x, np.nan))
+
+    g = Constraint(np.arctan, [0.0], derivative=slope)
     # arctan x = 0 at 0, log x = -1 at 1/e
     assert np.abs(retract([[3.0], [-20.0]], g)).max() < 1e-14
-    g = Constraint(lambda v: np.log(np.where(v > 0, v, np.nan)), [-1.0])
+    g = Constraint(log, [-1.0])
     retracted = retract([[5.0], [0.1]], g)
     assert np.abs(retracted - np.exp(-1)).max() < 1e-15
 
@@ -247,7 +260,8 @@ def test_a_jacobian_by_formula_and_by_differences() -> None:
     g = norm_constraint([0, 2])
     slope = g.jacobian(x)
     assert slope.shape == (2, 5, 1, 4)
-    assert np.array_equal(slope[..., 0, [0, 2]], 2 * x[..., [0, 2]])
+    expected = 2 * x[..., [0, 2]]
+    assert np.array_equal(slope[..., 0, [0, 2]], expected)
     assert not slope[..., 0, [1, 3]].any()
     by_differences = Constraint(g.function, g.value).jacobian(x)
     assert np.abs(slope - by_differences).max() < 1e-8

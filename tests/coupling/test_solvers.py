@@ -28,7 +28,8 @@ def _case(seed: int, n: int = 24, m: int = 24, d: int = 3) -> tuple[np.ndarray, 
     columns = rng.random(m)
     rows[: n // 6] = 0.0
     columns[-1] = 0.0
-    return squared_distances(x, y), rows / rows.sum(), columns / columns.sum()
+    cost = squared_distances(x, y)
+    return cost, rows / rows.sum(), columns / columns.sum()
 
 
 def _assert_marginals(plan: TransportPlan, a: np.ndarray, b: np.ndarray) -> None:
@@ -179,7 +180,8 @@ def test_the_entropic_plan_satisfies_its_optimality_conditions(
     assert -1e-9 < excess < weight * np.log(n * m)
     # On all but negligible entries the logarithm is a sum of potentials.
     i, j = (plan.matrix > 1e-6).nonzero()
-    logs = np.log(plan.matrix[i, j]) + cost[i, j] / weight
+    scaled_costs = cost[i, j] / weight
+    logs = np.log(plan.matrix[i, j]) + scaled_costs
     design = np.zeros((i.size, n + m))
     entries = np.arange(i.size)
     design[entries, i] = 1.0

@@ -171,7 +171,8 @@ def test_the_correction_in_any_units(std: list[float], offset: list[float]) -> N
     # The accuracy of a component is that of its own size, not of the largest one.
     assert (mean_error < 1e-12 * (np.abs(offset) + std)).all()
     error = _covariance(corrected) - _covariance(x, weights)
-    assert np.abs(error / np.outer(std, std)).max() < 1e-8
+    relative_error = error / np.outer(std, std)
+    assert np.abs(relative_error).max() < 1e-8
 
 
 def test_the_correction_does_not_stretch_rounding() -> None:

@@ -37,8 +37,9 @@ def test_the_generator_of_four_cells_by_hand() -> None:
     d = 0.2
     h = 0.25
     swarm = Swarm(lambda x, t: v + 0 * x, d, low=[0.0], high=[1.0])
-    up = float(bernoulli(-v * h / d)) * d / h**2
-    down = float(bernoulli(v * h / d)) * d / h**2
+    peclet = v * h / d
+    up = float(bernoulli(-peclet)) * d / h**2
+    down = float(bernoulli(peclet)) * d / h**2
     # Columns sum to zero: the walls are closed.
     diagonal = np.diag([-up, -up - down, -up - down, -down])
     upwards = np.diag([up] * 3, -1)
@@ -68,7 +69,9 @@ def test_schemes_are_their_definitions(scheme: str) -> None:
     """With dense matrices, for three densities and a drift that depends on time."""
 
     def drift(x: np.ndarray, t: float) -> np.ndarray:
-        return np.stack([np.sin(t + x[..., 1]), x[..., 0]], axis=-1)
+        first = np.sin(t + x[..., 1])
+        second = x[..., 0]
+        return np.stack([first, second], axis=-1)
 
     equation = FokkerPlanck(Swarm(drift, [0.1, 0.3]), Grid((4, 5)), scheme=scheme)
     p = np.random.default_rng(1).random((3, 20))
@@ -113,8 +116,12 @@ def test_the_stationary_density_of_an_ornstein_uhlenbeck_process(
     grid = Grid((n, n))
     swarm = Swarm(lambda x, t: k * (0.5 - x), d)
     equation = FokkerPlanck(swarm, grid, scheme="backward_euler")
+
     # The density is the product of exp(-k (x - ½)²/(2 D)) along the axes.
-    factor = _cell_means(grid, lambda s: np.exp(-k * (s - 0.5) ** 2 / (2 * d)))
+    def profile(s: float) -> float:
+        return float(np.exp(-k * (s - 0.5) ** 2 / (2 * d)))
+
+    factor = _cell_means(grid, profile)
     exact = grid.normalize(np.outer(factor, factor).ravel())
     # Until nothing changes any more: 1e4 is many times 1 / k.
     p = equation.evolve(np.ones(grid.size), [50.0, 200.0, 1e4])[-1]
@@ -131,7 +138,8 @@ GROWING = Swarm(
 def test_a_diffusion_that_varies_is_meant_in_the_sense_of_ito() -> None:
     """Without drift D p is constant at rest: p = 1/((1 + x) log 2) for D ∝ 1 + x."""
     grid = Grid((200,))
-    p = FokkerPlanck(GROWING, grid).evolve(np.ones(200), [50.0, 1000.0])[-1]
+    equation = FokkerPlanck(GROWING, grid)
+    p = equation.evolve(np.ones(200), [50.0, 1000.0])[-1]
     # 0 = (D p)'' between closed walls
     product = p * (1 + grid.centres[:, 0]) * np.log(2)
     assert np.abs(product - 1).max() < 1e-5

@@ -42,7 +42,8 @@ def test_two_steps_are_the_textbook_kalman_filter(filters: int) -> None:
     for y in RNG.standard_normal((2, filters, n)):
         # The textbook's filter: P⁻ = Φ P Φᵀ + Q Δ, K = P⁻ (P⁻ + R/Δ)⁻¹
         means = means @ phi.T
-        covs = phi @ covs @ phi.T + dt * q @ q.T
+        process_cov = dt * q @ q.T
+        covs = phi @ covs @ phi.T + process_cov
         noise = r[:, :, None] * np.eye(n) / dt
         gains = covs @ np.linalg.inv(covs + noise)
         means = means + np.einsum("fij,fj->fi", gains, y - means)

@@ -81,6 +81,7 @@ def test_runs_are_smoothed_independently(missing: float) -> None:
     y[rng.random(y.shape) < missing] = np.nan
     run = kalman_filter(np.zeros(D), np.eye(D), y, **model)
     smooth = rts_smoother(run, **matrices)
+    # Without gaps one covariance serves all runs: it does not depend on the values.
     assert smooth.covariances.shape == run.covariances.shape
     assert (smooth.covariances == smooth.covariances.mT).all()
     for k in range(RUNS):
@@ -98,6 +99,7 @@ def test_run_axes_broadcast() -> None:
     means = rng.standard_normal((3, D))
     covs = spd(rng, D, (2, 1))
     run = kalman_filter(means, covs, y, **model)
+    # (2, 3) of the observations, (3,) of the means and (2, 1) of the covariances
     assert run.means.shape == (STEPS, 2, 3, D)
     assert run.log_likelihood.shape == (STEPS, 2, 3)
     single = kalman_filter(means[2], covs[1, 0], y[:, 1, 2], **model)

@@ -40,6 +40,7 @@ def test_local_inverts_retract(dim: int, first: int) -> None:
     chart = QuaternionChart(dim, first)
     rng = np.random.default_rng(dim)
     x = rng.standard_normal((5, dim))
+    # Rotations of less than π, for which the error is unique
     e = 0.5 * rng.standard_normal((5, dim - 1))
     result = chart.retract(x, e)
     assert np.abs(chart.local(x, result) - e).max() < 1e-13
@@ -59,7 +60,8 @@ def test_retract_rotates_the_quaternion_and_adds_to_other_components(
     rotated = rotate(x[:, q], e[:, first : first + 3])
     assert np.allclose(result[:, q], rotated, atol=1e-15)
     lengths = np.linalg.norm(x[:, q], axis=1)
-    assert np.abs(np.linalg.norm(result[:, q], axis=1) - lengths).max() < 1e-13
+    new_lengths = np.linalg.norm(result[:, q], axis=1)
+    assert np.abs(new_lengths - lengths).max() < 1e-13
     # The other components of state and error
     others = np.delete(np.arange(dim), q)
     other_errors = np.delete(np.arange(dim - 1), slice(first, first + 3))
@@ -95,7 +97,8 @@ def test_projection_inverts_the_basis_and_ignores_the_quaternion_s_length(
     assert np.allclose(chart.project(x, state_cov), cov)
     # A change of the length along the quaternion is no error.
     along = np.zeros_like(x)
-    along[:, first : first + 4] = x[:, first : first + 4]
+    quaternion = slice(first, first + 4)
+    along[:, quaternion] = x[:, quaternion]
     radial = along[..., None] * along[:, None]
     assert np.abs(chart.project(x, radial)).max() < 1e-13
 
@@ -111,6 +114,7 @@ def test_a_flat_chart_gives_the_extended_kalman_filter() -> None:
     y = stack(sensors).observe(states, rng=rng)
     y[1, 2, 0] = np.nan
     options = {"model": model, "sensors": sensors, "times": [0.3, 0.8, 1.8]}
+    # With x + e as retraction the error-state filter is the extended filter.
     result = mekf(start, cov, y, chart=_FlatChart(5, 0), **options)
     expected = filterpy_ekf(start, cov, y, **options)
     np.testing.assert_allclose(result.means, expected.means, rtol=0, atol=1e-13)
@@ -150,6 +154,7 @@ def test_errors_are_propagated_by_the_derivative_of_the_transition_in_the_chart(
     q = spd(rng, 13)
     pose = satellite_pose(rate=0.3, sigma=0.0)
     model = replace(pose, noise_cov=lambda t, dt: (1 + t) * q)
+    # An increment depends on both ends of the step, whose errors are correlated.
     run = mekf(
         x,
         cov,
@@ -174,7 +179,8 @@ def test_errors_are_propagated_by_the_derivative_of_the_transition_in_the_chart(
 
     zero = np.zeros(12)
     forecast = end(zero)
-    # Initial errors and noises are independent: (e, w) with a block diagonal covariance.
+    # Initial errors and noises are independent: (e, w) with a block diagonal
+    # covariance.
     joint = block_diag(cov, POSE.project(forecast, q))
     # Final error A e + w, and observed increment C e + H B w
     a = np.hstack([central_difference(end_error, zero), np.eye(12)])
@@ -246,6 +252,7 @@ def test_the_uncertainty_of_an_attitude_is_consistent_and_its_length_conserved()
     x0 = np.array([*translation, 0.3, 0.2, 0.1, 1.0, 0.0, 0.0, 0.0])
     cov = 0.01 * np.eye(12)
     errors = 0.1 * rng.standard_normal((runs, 12))
+    # The truth is drawn from the filter's prior.
     truth = POSE.retract(np.broadcast_to(x0, (runs, 13)), errors)
     times = 0.1 * np.arange(1, 21)
     states = simulate(model, truth, times, rng=rng)

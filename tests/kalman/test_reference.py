@@ -152,6 +152,7 @@ def test_an_angle_may_wrap(filter_: Callable[..., Any]) -> None:
         "sensors": [bearing([0, 1], std=0.01)],
         "times": [1e-9],
     }
+    # The mean's bearing is just below π, the observed one just above -π.
     mean = np.array([-1.0, 0.02])
     cov = 0.01 * FULL / 4
     run = filter_(mean, cov, [[-np.pi + 0.02]], **options)
@@ -165,7 +166,7 @@ def test_an_angle_may_wrap(filter_: Callable[..., Any]) -> None:
     np.testing.assert_allclose(wrapped.means, run.means, atol=1e-12)
 
 
-def test_what_the_sensor_cannot_see_is_missing() -> None:
+def test_an_undefined_bearing_is_missing() -> None:
     """A mean at the sensor's position has no bearing; the distance is used nevertheless."""
     options = {
         "model": walk(2),
@@ -203,7 +204,9 @@ def test_extended_steps_are_the_linearised_formulas(
     p = FULL
     for t, dt in ((0.0, 2.0), (2.0, 0.5)):
         # P ← J P Jᵀ + Q(t, dt), with the Jacobian at the last mean
-        jacobian = np.array([[np.cos(x[0]), 0.0], [x[1] * dt, x[0] * dt]])
+        first_row = [np.cos(x[0]), 0.0]
+        second_row = [x[1] * dt, x[0] * dt]
+        jacobian = np.array([first_row, second_row])
         noise_cov = (1 + t) * dt * FULL
         p = jacobian @ p @ jacobian.T + noise_cov
         x = transition(x, t, dt)

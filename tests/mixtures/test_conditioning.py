@@ -40,7 +40,8 @@ def test_linear_problems_are_the_kalman_filter(seed: int, d: int) -> None:
     # Forecast: F m and F P Fᵀ + Q.
     forecast = propagate_mixture(p, lambda x: x @ f.T, q)
     assert np.allclose(forecast.means, p.means @ f.T)
-    assert np.allclose(forecast.covs, f @ p.covs @ f.T + q @ q.T)
+    propagated = f @ p.covs @ f.T
+    assert np.allclose(forecast.covs, propagated + q @ q.T)
     # Update with the gain K = P Hᵀ S⁻¹ of each component.
     y = 3 * rng.standard_normal(2)
     analysis = update_mixture(forecast, y, lambda x: x @ h.T, r)
@@ -64,7 +65,8 @@ def test_linear_problems_are_the_kalman_filter(seed: int, d: int) -> None:
 
 
 def test_curvature_adds_to_the_covariance() -> None:
-    # The variance of x² is 4 m² P + 2 P², which DD2 meets; its covariance with x is 2 m P.
+    # The variance of x² is 4 m² P + 2 P², which DD2 meets; its covariance with x is 2 m
+    # P.
     m = 1.5
     p = 0.8
     r = 0.3
@@ -147,7 +149,8 @@ def test_angles_that_wrap_between_points() -> None:
     def wrap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return (a - b + np.pi) % (2 * np.pi) - np.pi
 
-    # Bearings near ±π, and the same problem turned by a right angle, where nothing wraps.
+    # Bearings near ±π, and the same problem turned by a right angle, where nothing
+    # wraps.
     position = np.array([-5.0, 0.01])
     rotation = np.array([[0.0, -1.0], [1.0, 0.0]])
     noise = 0.01 * np.eye(1)

@@ -53,11 +53,13 @@ def merge_by_brute_force(p: GaussianMixture, size: int) -> GaussianMixture:
     def merge(i: int, j: int) -> tuple[float, np.ndarray, np.ndarray]:
         # Weight, mean and covariance of both are kept.
         total = w[i] + w[j]
-        mean = (w[i] * m[i] + w[j] * m[j]) / total
+        weighted_sum = w[i] * m[i] + w[j] * m[j]
+        mean = weighted_sum / total
         cov = np.zeros_like(c[i])
         for k in (i, j):
             difference = m[k] - mean
-            cov += w[k] / total * (c[k] + np.outer(difference, difference))
+            share = w[k] / total
+            cov += share * (c[k] + np.outer(difference, difference))
         return total, mean, cov
 
     def cost(i: int, j: int) -> float:

@@ -15,7 +15,8 @@ from distfilt.models import LinearModel, Model, constant_velocity, simulate
 from distfilt.models.satellite import clohessy_wiltshire
 from tests.support import generator
 
-# Full, of several components, and without a symmetry that would hide a transposed factor.
+# Full, of several components, and without a symmetry that would hide a transposed
+# factor.
 FULL = np.array([[4.0, 1.2, -0.6], [1.2, 1.0, 0.3], [-0.6, 0.3, 0.5]])
 
 

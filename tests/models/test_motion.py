@@ -58,7 +58,8 @@ BUFFER = np.empty(2)
 @pytest.mark.parametrize(
     "rate",
     [
-        # One array for all results; the states themselves; a copy of the changed states.
+        # One array for all results; the states themselves; a copy of the changed
+        # states.
         lambda x, t: np.multiply(x, -np.cos(t), out=BUFFER),
         lambda x, t: np.multiply(x, -np.cos(t), out=x),
         lambda x, t: np.multiply(x, -np.cos(t), out=x).copy(),
@@ -104,8 +105,10 @@ def test_names_and_units_of_straight_motion() -> None:
 def _lorenz_rate(t: float, states: np.ndarray) -> np.ndarray:
     """Lorenz's equations of twenty states in one vector, for scipy's integrator."""
     x, y, z = states.reshape(20, 3).T
-    rates = [10 * (y - x), x * (28 - z) - y, x * y - 8 / 3 * z]
-    return np.stack(rates, axis=-1).ravel()
+    x_rate = 10 * (y - x)
+    y_rate = x * (28 - z) - y
+    z_rate = x * y - 8 / 3 * z
+    return np.stack([x_rate, y_rate, z_rate], axis=-1).ravel()
 
 
 def test_lorenz_s_model_converges_to_an_adaptive_integrator() -> None:

@@ -58,7 +58,7 @@ def test_the_score_is_the_gradient_of_the_log_density(axis: int) -> None:
 def test_the_score_is_finite_where_the_density_underflows() -> None:
     f = RotatingMixture(variance=1e-5)
     assert f.density([0.0, 0.0], 0.0) == 0
-    # ∇p / p would be 0 / 0: the score is Σ r_l (m_l - x) / σ² with responsibilities r_l.
+    # ∇p / p would be 0 / 0; Σ r_l (m_l - x) / σ² with responsibilities r_l is not.
     assert np.isfinite(f.score([0.0, 0.0], 0.0)).all()
 
 
@@ -103,7 +103,8 @@ def test_agents_drift_and_spread_by_2_d_t_on_each_axis() -> None:
         lambda x, t: 0 * x + 0.02 * t, lambda x, t: 0 * x + (1 + t) * DIFFUSION
     )
     n = 40_000
-    x = swarm.step(np.full((n, 2), 0.5), 0.0, 2.0, rng=np.random.default_rng(4))
+    start = np.full((n, 2), 0.5)
+    x = swarm.step(start, 0.0, 2.0, rng=np.random.default_rng(4))
     # 2 D ∫(1 + t) dt = 2 D (2 + 1.8), within four standard errors of a variance
     ratio = x.var(axis=0) / (7.6 * DIFFUSION)
     assert np.abs(ratio - 1).max() < 4 * np.sqrt(2 / n)

@@ -13,7 +13,7 @@ from distfilt.ensembles import mean, sample_covariance
 from distfilt.network import Channel, Faults, Graph, UnstableGain, graphs
 from distfilt.network.channel import kind_of_rule
 from tests.network.helpers import DISK, STAR, arrivals, gaussians, lossy, rng, star
-from tests.support import unit_gap
+from tests.support import relative_difference
 
 RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
 GAIN = 0.04
@@ -95,7 +95,7 @@ def test_all_agents_at_once_are_each_by_its_definition(
             std = np.sqrt(np.diagonal(expected_cov))
             error = (means[run, 0, agent] - expected_mean) / std
             assert np.abs(error).max() < 1e-7
-            assert unit_gap(covs[run, 0, agent], expected_cov) < 1e-7
+            assert relative_difference(covs[run, 0, agent], expected_cov) < 1e-7
     assert (covs == np.swapaxes(covs, -1, -2)).all()
 
 
@@ -189,7 +189,7 @@ def test_intersection_gives_the_fused_moments(rule: str) -> None:
     # Members are moved affinely: their sample moments are exactly the fused ones.
     error = (mean(fused) - means) / ensembles.std(axis=-2)
     assert np.abs(error).max() < 1e-10
-    assert unit_gap(sample_covariance(fused), covs) < 1e-10
+    assert relative_difference(sample_covariance(fused), covs) < 1e-10
     # 4 + 10 numbers on each link and round.
     assert (channel.ledger.scalars == 2 * 14 * OUT_DEGREE).all()
 

@@ -113,7 +113,8 @@ def test_residual_keeps_nan_of_either_argument() -> None:
     assert np.isnan(residual[0, :2]).all()
     assert residual[0, 2] == 2.0
     # Also of a residual that wraps.
-    wrapped = bearing([0, 1], std=0.1).residual([[NAN], [1.0]], [[1.0], [NAN]])
+    angle = bearing([0, 1], std=0.1)
+    wrapped = angle.residual([[NAN], [1.0]], [[1.0], [NAN]])
     assert np.isnan(wrapped).all()
 
 

@@ -39,7 +39,8 @@ def test_an_angle_s_residual_is_the_short_way(y: float, p: float) -> None:
     The residual is at most half a period, and k times it is the angle from p to y.
     """
     for sensor, k in ((bearing, 1), (line_angle, 2)):
-        residual = sensor([0, 1], std=0.1).residual([y / k], [p / k])[0]
+        angle = sensor([0, 1], std=0.1)
+        residual = angle.residual([y / k], [p / k])[0]
         assert abs(residual) <= np.pi / k
         # Angles are equal on the circle if exp(i a) are.
         difference = np.exp(1j * (y - p))

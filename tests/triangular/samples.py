@@ -28,6 +28,8 @@ def banana(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Draw members on a parabola: noisy observations of x_2, members, and their normals."""
     u = rng_of(seed).standard_normal((*leading, n, 3))
-    x = np.stack([u[..., 0], 0.5 * u[..., 1] + u[..., 0] ** 2], axis=-1)
+    first = u[..., 0]
+    second = 0.5 * u[..., 1] + first**2
+    x = np.stack([first, second], axis=-1)
     y = x[..., 1:] + 0.3 * u[..., 2:]
     return y, x, u[..., :2]

@@ -35,7 +35,8 @@ def test_order_zero_is_the_affine_map(seed: int, m: int, d: int) -> None:
     assert np.abs(value_error).max() < 1e-8
     log_det_error = s.log_det(y, x) - expected.log_det(y, x)
     assert np.abs(log_det_error).max() < 1e-8
-    difference = compose(s, y, x, y[0]) - compose(expected, y, x, y[0])
+    expected_members = compose(expected, y, x, y[0])
+    difference = compose(s, y, x, y[0]) - expected_members
     assert np.abs(difference).max() < 1e-8
 
 
@@ -56,7 +57,8 @@ def test_a_map_increases_inverts_and_is_triangular(seed: int, p: int, q: int) ->
     y, x, _ = banana(seed)
     s = fit(y, x, order=(p, q))
     z = s(y, x)
-    assert np.abs(s.inverse(y, z) - x).max() < 1e-9
+    inverse_error = s.inverse(y, z) - x
+    assert np.abs(inverse_error).max() < 1e-9
     for slopes in s.slopes:
         # Nonnegative steps and a line of slope 0.1 or more: each component increases.
         assert (slopes >= 0).all()
@@ -74,9 +76,11 @@ def test_a_batched_fit_is_each_ensemble_s() -> None:
     batch = fit(y, x, order=2)
     single = fit(y[1, 2], x[1, 2], order=2)
     z = batch(y, x)
-    error = z[1, 2] - single(y[1, 2], x[1, 2])
-    assert np.abs(error).max() < 1e-7
-    assert np.abs(batch.inverse(y, z) - x).max() < 1e-9
+    expected = single(y[1, 2], x[1, 2])
+    assert np.abs(z[1, 2] - expected).max() < 1e-7
+    inverse_error = batch.inverse(y, z) - x
+    assert np.abs(inverse_error).max() < 1e-9
+    # One observation for all members of an ensemble
     observed = y[..., 0, :]
     inverse = batch.inverse(observed, z)[1, 2]
     expected = single.inverse(observed[1, 2], z[1, 2])
@@ -91,11 +95,13 @@ def test_sparse_components_do_not_depend_on_other_variables() -> None:
     # A constant; and a constant, a line and two bumps of x_1.
     assert s.weights[0].shape == (1,)
     assert s.weights[1].shape == (4,)
-    assert np.allclose(s(y, x), without_y(y[:, :0], x), atol=1e-12)
+    expected = without_y(y[:, :0], x)
+    assert np.allclose(s(y, x), expected, atol=1e-12)
     assert (s(y + 1, x) == s(y, x)).all()
     # The full map has the sparse one as a special case.
     full = fit(y, x, order=2)
-    assert affine.objective(full, y, x) <= affine.objective(s, y, x)
+    full_value = affine.objective(full, y, x)
+    assert full_value <= affine.objective(s, y, x)
 
 
 def test_sparse_components_need_few_members() -> None:
@@ -184,7 +190,8 @@ def test_coefficients_set_by_hand_against_the_formula() -> None:
     for k in range(2):
         standard = (points - s.centre) / s.std
         earlier, increasing, rates = _features(s, standard, k)
-        component = earlier @ s.weights[k] + increasing @ s.slopes[k]
+        offset = earlier @ s.weights[k]
+        component = offset + increasing @ s.slopes[k]
         assert np.abs(z[:, k] - component).max() < 1e-12
         # A triangular map's determinant is the product of its diagonal derivatives.
         derivative = rates @ s.slopes[k] / s.std[1 + k]
@@ -209,7 +216,8 @@ def test_a_fit_minimises_a_program_built_by_hand(penalty: float) -> None:
         # ½ S² - log ∂S
         terms = 0.5 * value**2 - np.log(rates @ slopes)
         # The constant, two lines, and the own line have no penalty.
-        squares = (weights[3:] ** 2).sum() + (slopes[1:] ** 2).sum()
+        penalised = np.concatenate([weights[3:], slopes[1:]])
+        squares = (penalised**2).sum()
         return float(terms.mean() + 0.5 * penalty * squares)
 
     solution = np.concatenate([s.weights[1], s.slopes[1]])
@@ -237,6 +245,7 @@ def test_bumps_are_placed_at_quantiles() -> None:
         assert np.allclose(centres, quantile[[1, 3]])
         assert np.allclose(widths, quantile[[2, 4]] - quantile[[0, 2]])
     for k in range(2):
+        # Three steps at 2/8, 4/8 and 6/8 of the state's variables
         quantile = np.quantile(joint[:, 1 + k], np.arange(1, 8) / 8)
         centres, widths = s.steps[:, k]
         assert np.allclose(centres, quantile[[1, 3, 5]])

@@ -19,6 +19,7 @@ def test_an_update_depends_on_its_arguments_and_the_generator_only(name: str) ->
     x = members(30, 2)
     data = (x, x @ H.T, np.tile(Y, (2, 1)), R.copy())
     copies = [array.copy() for array in data]
+    # Two ensembles with the same observation and noise
     analysis = update(*data, rng=rng(5))
     assert analysis.shape == x.shape
     assert np.isfinite(analysis).all()

@@ -15,7 +15,8 @@ from .cases import H, R, Y, members
 def _gain(x: np.ndarray, y: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Return the gain C_xy (C_yy + R)^-1 of samples by numpy, for three components."""
     joint = np.cov(np.hstack([x, y]).T)
-    return joint[:3, 3:] @ np.linalg.inv(joint[3:, 3:] + noise)
+    innovation_cov = joint[3:, 3:] + noise
+    return joint[:3, 3:] @ np.linalg.inv(innovation_cov)
 
 
 def test_perturbed_observations_by_their_formulas() -> None:
@@ -45,8 +46,11 @@ def test_perturbed_observations_by_their_formulas() -> None:
 def test_moments_after_a_nonlinear_observation_are_exact(update: Update) -> None:
     """P+ = P - K S K' for the sample covariances, also where h is not linear."""
     x = members(20)
-    h = np.stack([x[:, 0] ** 2, x[:, 1] * x[:, 2]], axis=1)
+    square = x[:, 0] ** 2
+    product = x[:, 1] * x[:, 2]
+    h = np.stack([square, product], axis=1)
     joint = np.cov(np.hstack([x, h]).T)
+    # S = C_hh + R, of the sample moments of state and prediction
     s = joint[3:, 3:] + R
     gain = _gain(x, h, R)
     analysis = update(x, h, Y, R, rng=np.random.default_rng(0))
@@ -65,7 +69,8 @@ def test_etkf_without_rotation_is_symmetric() -> None:
     # S = H X' R^(-1/2) / √(N - 1)
     predicted_anomalies = anomalies @ H.T
     whitened = np.linalg.solve(root, predicted_anomalies.T).T / np.sqrt(8)
-    values, vectors = np.linalg.eigh(np.eye(9) + whitened @ whitened.T)
+    precision = np.eye(9) + whitened @ whitened.T
+    values, vectors = np.linalg.eigh(precision)
     transform = vectors @ np.diag(values**-0.5) @ vectors.T
     analysis = etkf(x, x @ H.T, Y, R, rng=np.random.default_rng(0), rotation="none")
     new_anomalies = analysis - analysis.mean(axis=0)

@@ -120,6 +120,7 @@ def test_jitter_of_copies_changes_only_them() -> None:
     covariance = np.array([[2.0, 0.6], [0.6, 0.5]])
     normal = rng().standard_normal(x.shape)
     jittered = add_jitter(x, covariance, 0.5, normal, is_copy)
+    # Members 2 and 6 have no copy.
     single = [2, 6]
     copies = [0, 1, 3, 4, 5]
     assert (jittered[:, single] == x[:, single]).all()

@@ -137,5 +137,6 @@ def test_nothing_is_drawn_without_rejuvenation() -> None:
     first = etpf(*data, rng=rng_of(1), rejuvenation=0.2)
     second = etpf(*data, rng=rng_of(2), rejuvenation=0.2)
     assert (first != second).any()
+    # Rejuvenation follows the transform, with the same generator.
     expected = coupling.rejuvenate(transformed, x, bandwidth=0.2, rng=rng_of(1))
     assert np.array_equal(first, expected)

@@ -29,6 +29,7 @@ def test_inflation_multiplies_anomalies_only() -> None:
     data = (x, x @ H.T, Y, R)
     analysis = updates.enkf(*data, rng=rng())
     inflated = updates.with_inflation(updates.enkf, factor=1.3)(*data, rng=rng())
+    # m + λ (x - m)
     mean = analysis.mean(axis=0)
     assert np.allclose(inflated, mean + 1.3 * (analysis - mean), atol=1e-12)
 
@@ -61,6 +62,7 @@ def test_missing_components_in_a_stack_with_several_covariances(name: str) -> No
     x = members(30, 3)
     h = x @ H.T
     noise = np.stack([R, 2 * R, 3 * R])
+    # Complete, without the second component, and without any
     y = np.stack([Y, [Y[0], np.nan], [np.nan, np.nan]])
     apply = partial(updates.with_missing, UPDATES[name], x, h)
     analysis = apply(y, noise, rng=rng())
@@ -69,6 +71,7 @@ def test_missing_components_in_a_stack_with_several_covariances(name: str) -> No
     assert (analysis[2] == x[2]).all()
     assert (analysis[1] != x[1]).any()
     assert np.allclose(analysis[0], complete[0], rtol=0, atol=1e-12)
+    # The first two ensembles exchange their observations.
     swapped = apply(y[[1, 0, 2]], noise, rng=rng())
     assert np.allclose(swapped[1], complete[1], rtol=0, atol=1e-12)
 
@@ -93,6 +96,7 @@ def test_the_options_of_a_partial_are_kept_and_checked() -> None:
     assert np.array_equal(unchecked, ETKF(*data, rng=rng()))
     assert has_tag(ETKF, "stacks")
     assert not has_tag(partial(print, 3), "stacks")
+    # A function without the decorator has no tags.
     plain = updates.with_inflation(lambda x, h, y, r, *, rng: x, factor=1.0)
     assert not has_tag(plain, "stacks")
     with pytest.raises(ValueError, match="rotation"):
@@ -121,6 +125,7 @@ def test_calls_inside_a_user_s_update_are_checked() -> None:
 
     x = members(5)
     inflated = updates.with_inflation(transform, factor=1.1)
+    # "simplex" is no solver: the mistake is the user's, in every wrapper.
     for update in (transform, inflated, partial(updates.with_missing, inflated)):
         with pytest.raises(ValueError, match="^solver must"):
             update(x, x @ H.T, Y, R, rng=rng())
@@ -143,7 +148,8 @@ def test_serial_updates_without_a_sensor_are_exact_for_linear_observations() -> 
     for noise in (independent, correlated):
         analysis = update(x, x @ H.T, [Y, Y], noise, rng=rng())
         for k in range(2):
-            mean, cov = kalman(*moments(x[k]), H, noise[k], Y)
+            prior_mean, prior_cov = moments(x[k])
+            mean, cov = kalman(prior_mean, prior_cov, H, noise[k], Y)
             assert np.allclose(analysis[k].mean(axis=0), mean, atol=1e-12)
             assert np.allclose(np.cov(analysis[k].T), cov, atol=1e-12)
 
@@ -159,8 +165,10 @@ def test_serial_updates_predict_again() -> None:
     data = (x, predict(x), y, np.diag([0.5, 0.9]))
     update = updates.serially(ETKF)
     analysis = update(*data, rng=rng(), predict=predict)
-    first = ETKF(x, predict(x)[:, :1], y[:1], [[0.5]], rng=rng())
-    second = ETKF(first, predict(first)[:, 1:], y[1:], [[0.9]], rng=rng())
+    h = predict(x)[:, :1]
+    first = ETKF(x, h, y[:1], [[0.5]], rng=rng())
+    h = predict(first)[:, 1:]
+    second = ETKF(first, h, y[1:], [[0.9]], rng=rng())
     assert np.allclose(analysis, second, atol=1e-13)
     # Predictions that move along with the members differ, since h is not linear.
     without_predict = update(*data, rng=rng())
@@ -203,7 +211,8 @@ def test_stochastic_forecast_adds_q_on_average() -> None:
     model = Model(2, lambda x, t, dt: x @ phi.T, lambda t, dt: dt * q)
     x = members(100_000)[:, :2]
     forecast = updates.stochastic_forecast(x, model, 0.0, 0.5, rng=rng())
-    expected = phi @ np.cov(x.T) @ phi.T + 0.5 * q
+    propagated = phi @ np.cov(x.T) @ phi.T
+    expected = propagated + 0.5 * q
     assert np.allclose(np.cov(forecast.T), expected, atol=0.03)
 
 
@@ -251,6 +260,7 @@ def test_augmentation_is_one_more_observation(update: Update) -> None:
     positions = x[:, :2]
     squares = (positions**2).sum(axis=1)
     predicted = np.column_stack([positions, squares])
+    # Block diagonal: R of the sensor, and σ² of the constraint
     noise = np.zeros((3, 3))
     noise[:2, :2] = NOISE
     noise[2, 2] = 0.2**2
@@ -337,8 +347,10 @@ def test_localised_observations_on_a_ring_are_assimilated_in_turn(
     noise = np.diag([0.5, 0.9])
     update = localize_on_ring([0, 2])
     analysis = update(x, x[:, [0, 2]], y, noise, rng=rng(), **options)
-    first = localize_on_ring([0])(x, x[:, :1], y[:1], [[0.5]], rng=rng())
-    second = localize_on_ring([2])(first, first[:, 2:], y[1:], [[0.9]], rng=rng())
+    update_first = localize_on_ring([0])
+    first = update_first(x, x[:, :1], y[:1], [[0.5]], rng=rng())
+    update_second = localize_on_ring([2])
+    second = update_second(first, first[:, 2:], y[1:], [[0.9]], rng=rng())
     assert np.allclose(analysis, second, atol=1e-12)
 
 
