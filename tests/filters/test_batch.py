@@ -147,6 +147,16 @@ def draw_links(rng: Any, shape: tuple[int, int, int], all_or_none: bool) -> np.n
     return links & ~np.eye(shape[1], dtype=bool)
 
 
+def find_contacts(times: np.ndarray, links: np.ndarray, every: float) -> np.ndarray:
+    """Whether agents exchange observations, at each time (T,)."""
+    contact = links.any(axis=(1, 2))
+    if every:
+        # Contacts are at the first time after each multiple of the interval.
+        intervals = np.floor(times / every)
+        contact[1:] &= np.diff(intervals) > 0
+    return contact
+
+
 def draw_team(rng: Any, agents: int) -> list[list[Sensor]]:
     """Draw up to two sensors for each agent, which may be of one kind."""
     team = []
@@ -193,15 +203,10 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
     times = np.cumsum(rng.uniform(0.05, 0.5, steps + 1)) - 0.3
     links = draw_links(rng, (steps + 1, agents, agents), family == "news")
     every = rng.choice([0.0, 0.3])
-    contact = links.any(axis=(1, 2))
-    if every:
-        # Contacts are at the first time after each multiple of the interval.
-        intervals = np.floor(times / every)
-        contact[1:] &= np.diff(intervals) > 0
+    contact = find_contacts(times, links, every)
     # Observations that wait for a contact need states to which they can return.
     waits = bool(every) or not contact[1:].all()
-    lag = steps if waits else rng.integers(steps + 1)
-    lag = int(lag)
+    lag = int(steps if waits else rng.integers(steps + 1))
     share = family != "mixture" and (family == "news" or rng.random() < 0.8)
     # Without process noise the other families are exact as well.
     q = Q if gaussian or family == "mixture" else 0 * Q
