@@ -186,6 +186,7 @@ togglebutton_hint_hide = "Hide"
 
 def check_toc(app: Sphinx) -> None:
     """Stop the build if a page of the table of contents has no file."""
+    # Sphinx alone would only warn, and build a book with a hole.
     missing = missing_pages()
     if missing:
         raise ExtensionError(
@@ -200,8 +201,11 @@ def copy_mathjax(app: Sphinx, error: Exception | None) -> None:
     spec = find_spec("sphinx-mathjax-offline")
     if spec is None or spec.origin is None:
         raise ExtensionError("sphinx-mathjax-offline is not installed: no mathematics")
+    # The package is an extension with MathJax beside its code; only the files are used.
     source = Path(spec.origin).parent / "static" / "mathjax"
     target = Path(app.outdir) / "_static" / "mathjax"
+    # Only output as CHTML with its fonts, TeX's extensions, and speech for readers who
+    # do not see
     for part in (
         "tex-mml-chtml.js",
         "output/chtml/fonts",
@@ -222,7 +226,9 @@ def find_name(app: Sphinx, env: Any, node: Any, text: Any) -> Any:
         return None
     entries = env.domains.python_domain.objects
     target = node["reftarget"].removeprefix("~")
+    # A name may be written by any path from which it can be imported.
     entry_of = {**env.distfilt_homes, **{path: path for path in entries}}
+    # As written, below the package, beside the page's module, beside its class.
     qualified = f"distfilt.{target}"
     module = node.get("py:module") or ""
     paths = [
@@ -232,12 +238,14 @@ def find_name(app: Sphinx, env: Any, node: Any, text: Any) -> Any:
         f"{module}.{node.get('py:class')}.{target}",
     ]
     matches = [entry_of[path] for path in paths if path in entry_of]
+    # A method such as Filter.run: the class is found first.
     owner, _, member = target.rpartition(".")
     matches += [
         f"{entry_of[path]}.{member}"
         for path in (owner, f"distfilt.{owner}")
         if path in entry_of
     ]
+    # At last the bare name anywhere; sorted, so that every build takes the same one.
     matches += sorted(
         {entry_of[path] for path in entry_of if path.endswith(f".{target}")}
     )
@@ -256,12 +264,14 @@ def link_names(
     source = ROOT / f"{page}.md"
     if page.startswith("book/api"):
         context["body"] = simplify_signatures(context["body"])
+    # Only cells of chapters have code with imports.
     if source not in chapters():
         return
     objects = app.env.domains.python_domain.objects
 
     def url(path: str) -> str | None:
         entry = objects.get(app.env.distfilt_homes.get(path, path))
+        # A link that works from this page, wherever the book is stored.
         address = entry and app.builder.get_relative_uri(page, entry.docname)
         return f"{address}#{entry.node_id}" if entry else None
 
@@ -269,6 +279,7 @@ def link_names(
         f'<p class="notebook"><a href="_notebooks/{source.stem}.ipynb" download>'
         "Download this page as a notebook</a></p>"
     )
+    # Only numbered chapters are offered for download, below their titles.
     if chapter_number(page):
         context["body"] = context["body"].replace("</h1>", f"</h1>\n{offer}", 1)
     names = imports_of(code_of(source), app.env.distfilt_homes)
@@ -293,9 +304,11 @@ def finish(app: Sphinx, error: Exception | None) -> None:
 
 
 def setup(app: Sphinx) -> None:
+    # Sphinx numbers figures by a collector, which has no event to listen to.
     number_figures = TocTreeCollector.assign_figure_numbers
 
     def with_chapter_numbers(self: Any, env: Any) -> list[str]:
+        # Both pages of a chapter count with its number, then get labels such as 1b.
         number_chapters(env, chapter_number)
         renumbered = number_figures(self, env)
         number_chapters(env, chapter_label)

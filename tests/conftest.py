@@ -6,7 +6,8 @@ import os
 
 from hypothesis import HealthCheck, settings
 
-# No deadline: a busy machine is no error. Derandomised, a fresh clone passes or fails always.
+# No deadline: a busy machine is no error. Derandomised, a fresh clone passes or fails
+# always.
 settings.register_profile("gate", derandomize=True, deadline=None, max_examples=40)
 settings.register_profile(
     "explore",

@@ -28,6 +28,7 @@ def spd(
 ) -> np.ndarray:
     """Random full covariances with eigenvalues above `least`."""
     a = rng.standard_normal((*leading, d, d))
+    # A Aᵀ + λ I has no eigenvalue below λ.
     return a @ np.swapaxes(a, -1, -2) + least * np.eye(d)
 
 
@@ -37,16 +38,16 @@ def singular(
     """Random full covariances of the given rank."""
     a = rng.standard_normal((*leading, d, rank))
     cov = a @ np.swapaxes(a, -1, -2)
+    # Exactly symmetric, though products are rounded
     return 0.5 * (cov + np.swapaxes(cov, -1, -2))
 
 
-def unit_gap(found: np.ndarray, wanted: np.ndarray) -> float:
-    """Largest difference of two covariances in units of the wanted standard deviations."""
-    std = np.sqrt(np.diagonal(wanted, axis1=-2, axis2=-1))
-    unit = np.where(std > 0, std, 1.0)
-    return float(
-        (np.abs(found - wanted) / (unit[..., :, None] * unit[..., None, :])).max()
-    )
+def relative_difference(actual: np.ndarray, expected: np.ndarray) -> float:
+    """Largest difference of two covariances, in units of the expected deviations."""
+    variances = np.diagonal(expected, axis1=-2, axis2=-1)
+    std = np.where(variances > 0, np.sqrt(variances), 1.0)
+    scale = std[..., :, None] * std[..., None, :]
+    return float((np.abs(actual - expected) / scale).max())
 
 
 def turning(*, sigma: float, turn_sigma: float) -> Model:
@@ -58,18 +59,17 @@ def turning(*, sigma: float, turn_sigma: float) -> Model:
         v = x[..., 2:4]
         tau = x[..., 4:] * dt
         normal = np.stack([-v[..., 1], v[..., 0]], axis=-1)
+        # p' = p + ∫ R(ω s) v ds, with integrals of cosine and sine smooth at ω = 0.
         along = np.sinc(tau / np.pi)
         across = 0.5 * tau * np.sinc(0.5 * tau / np.pi) ** 2
         position = p + dt * (along * v + across * normal)
-        return np.concatenate(
-            [position, np.cos(tau) * v + np.sin(tau) * normal, x[..., 4:]], axis=-1
-        )
+        velocity = np.cos(tau) * v + np.sin(tau) * normal
+        return np.concatenate([position, velocity, x[..., 4:]], axis=-1)
 
     def derivative(x: np.ndarray, t: float, dt: float) -> np.ndarray:
-        tau, v = (
-            x[..., 4, None, None] * dt,
-            x[..., 2:4, None],
-        )  # turns that are not tiny
+        # For turns that are not tiny
+        tau = x[..., 4, None, None] * dt
+        v = x[..., 2:4, None]
         one = np.eye(2)
         normal = np.array([[0.0, -1.0], [1.0, 0.0]])
         sine = np.sin(tau) / tau
@@ -79,9 +79,11 @@ def turning(*, sigma: float, turn_sigma: float) -> Model:
         jacobian[..., 4, 4] = 1.0
         jacobian[..., :2, 2:4] = dt * (sine * one + cosine * normal)
         jacobian[..., 2:4, 2:4] = np.cos(tau) * one + np.sin(tau) * normal
+        # Derivatives in the turn rate: of the position, and of the velocity
         bent = (np.cos(tau) - sine) * one + (np.sin(tau) - cosine) * normal
         jacobian[..., :2, 4:] = dt**2 / tau * (bent @ v)
-        jacobian[..., 2:4, 4:] = dt * (-np.sin(tau) * one + np.cos(tau) * normal) @ v
+        rotation_rate = -np.sin(tau) * one + np.cos(tau) * normal
+        jacobian[..., 2:4, 4:] = dt * rotation_rate @ v
         return jacobian
 
     def noise(t: float, dt: float) -> np.ndarray:

@@ -133,11 +133,11 @@ def test_numbers_are_converted_and_arrays_are_not_copied() -> None:
     swapped_bytes = np.array([[1, 2]], dtype=">f8")
     for value in ([[1, 2]], integers, swapped_bytes):
         result = validation.check_array(value, "x", (1, 2))
-        assert type(result) is np.ndarray and result.dtype == np.float64
+        assert type(result) is np.ndarray
+        assert result.dtype == np.float64
         assert result.tolist() == [[1.0, 2.0]]
-    with pytest.raises(
-        ValueError, match=r"^x must have shape \(\.\.\., N, 2\), got \(3,\)$"
-    ):
+    text = r"^x must have shape \(\.\.\., N, 2\), got \(3,\)$"
+    with pytest.raises(ValueError, match=text):
         validation.check_array(np.zeros(3), "x", (..., "N", 2))
 
 
@@ -184,9 +184,14 @@ def test_frozen_models_copy_and_freeze_arrays_and_construct_does_neither() -> No
     cov = np.eye(2)
     line = Line(2, cov, parts=[cov[0]])
     cov[0, 0] = 9.0
-    assert line.cov[0, 0] == line.parts[0][0] == 1.0 and not line.cov.flags.writeable
-    assert Line.construct(2, cov).cov is cov and Line.construct(2, cov).parts == ()
-    assert line.replace(dim=7).dim == 7 and pickle.loads(pickle.dumps(line)).dim == 2
+    assert line.cov[0, 0] == 1.0
+    assert line.parts[0][0] == 1.0
+    assert not line.cov.flags.writeable
+    constructed = Line.construct(2, cov)
+    assert constructed.cov is cov
+    assert constructed.parts == ()
+    assert line.replace(dim=7).dim == 7
+    assert pickle.loads(pickle.dumps(line)).dim == 2
 
 
 def test_validation_can_be_skipped() -> None:
@@ -215,11 +220,10 @@ def test_covariances_pass_in_any_units(seed: int, d: int) -> None:
     rng = generator(seed)
     unit = 10.0 ** rng.uniform(-100, 100, (3, d))
     cov = spd(rng, d, (3,)) * unit[:, :, None] * unit[:, None, :]
-    for rule in (
-        validation.check_positive_definite,
-        validation.check_positive_semidefinite,
-    ):
-        rule(0.5 * (cov + cov.swapaxes(1, 2)), "P")
+    cov = 0.5 * (cov + cov.swapaxes(1, 2))
+    # D P D for a diagonal D is definite if P is.
+    validation.check_positive_definite(cov, "P")
+    validation.check_positive_semidefinite(cov, "P")
 
 
 @pytest.mark.parametrize(
@@ -228,6 +232,7 @@ def test_covariances_pass_in_any_units(seed: int, d: int) -> None:
 def test_each_matrix_is_checked_in_the_units_of_its_components(rule: Any) -> None:
     # An error of a small component must not vanish beside a large one.
     hidden = np.diag([1e12, 1.0, 1.0])
+    # The eigenvalues of (1, 1.1; 1.1, 1) are 2.1 and -0.1.
     hidden[1, 2] = hidden[2, 1] = 1.1
     for cov, words in (
         (np.diag([1e12, -100.0]), "-100"),
@@ -243,16 +248,19 @@ def test_each_matrix_is_checked_in_the_units_of_its_components(rule: Any) -> Non
 
 
 def test_rounding_counts_neither_as_asymmetry_nor_as_a_negative_eigenvalue() -> None:
-    validation.check_positive_definite(
-        np.array([[1e12, 3e5], [3e5 * (1 + 1e-11), 1.0]]), "P"
-    )
+    nearly_symmetric = np.array([[1e12, 3e5], [3e5 * (1 + 1e-11), 1.0]])
+    validation.check_positive_definite(nearly_symmetric, "P")
+    # Smaller than the smallest normal number
     validation.check_positive_definite(1e-310 * np.eye(2), "P")
-    for cov in (np.outer([1.0, 1e-6, 1e6], [1.0, 1e-6, 1e6]), np.diag([0.0, 2.0])):
+    # Of rank one, with an eigenvalue of zero up to rounding
+    vector = np.array([1.0, 1e-6, 1e6])
+    for cov in (np.outer(vector, vector), np.diag([0.0, 2.0])):
         validation.check_positive_semidefinite(cov, "P")
+    # A correlation of 1 + 1e-8 is more than rounding.
+    correlation = 1.0 + 1e-8
+    indefinite = np.array([[1.0, correlation], [correlation, 1.0]])
     with pytest.raises(ValueError, match="smallest eigenvalue"):
-        validation.check_positive_semidefinite(
-            np.array([[1.0, 1.0 + 1e-8], [1.0 + 1e-8, 1.0]]), "P"
-        )
+        validation.check_positive_semidefinite(indefinite, "P")
 
 
 # --- annotations as strings -------------------------------------------------------------------

@@ -17,7 +17,7 @@ from distfilt.ensembles import (
     sample_covariance,
 )
 from distfilt.linalg import factor
-from tests.support import generator, singular, spd, unit_gap
+from tests.support import generator, relative_difference, singular, spd
 
 SEEDS = st.integers(0, 10_000)
 FULL = np.array([[4.0, 1.8, -0.6], [1.8, 1.5, 0.1], [-0.6, 0.1, 0.5]])
@@ -26,15 +26,18 @@ FULL = np.array([[4.0, 1.8, -0.6], [1.8, 1.5, 0.1], [-0.6, 0.1, 0.5]])
 
 def test_moments_are_their_definitions() -> None:
     x = generator(1).standard_normal((2, 7, 3)) @ FULL + 5.0
+    _, anomalies = center_ensemble(x)
+    covariances = sample_covariance(x)
     for k in range(2):
         assert np.allclose(mean(x)[k], x[k].mean(axis=0), rtol=1e-14)
-        assert np.allclose(
-            center_ensemble(x)[1][k], x[k] - x[k].mean(axis=0), atol=1e-14
-        )
-        joint = np.cov(x[k], rowvar=False)
-        assert np.allclose(sample_covariance(x)[k], joint, rtol=1e-12, atol=1e-13)
-    assert (sample_covariance(x) == sample_covariance(x).swapaxes(-1, -2)).all()
-    assert mean(x[:, :1]).shape == (2, 3) and (center_ensemble(x[:, :1])[1] == 0).all()
+        assert np.allclose(anomalies[k], x[k] - x[k].mean(axis=0), atol=1e-14)
+        expected = np.cov(x[k], rowvar=False)
+        assert np.allclose(covariances[k], expected, rtol=1e-12, atol=1e-13)
+    assert (covariances == covariances.swapaxes(-1, -2)).all()
+    # An ensemble of one member is its own mean.
+    assert mean(x[:, :1]).shape == (2, 3)
+    _, anomalies = center_ensemble(x[:, :1])
+    assert (anomalies == 0).all()
 
 
 # --- draws ------------------------------------------------------------------------------------
@@ -43,28 +46,28 @@ def test_moments_are_their_definitions() -> None:
 def test_draws_have_the_mean_and_the_full_covariance() -> None:
     """Each entry of the sample moments within 5 standard errors; a transposed factor is 50 off."""
     n = 20_000  # along all axes
-    x = draw([1.0, -2.0, 3.0], FULL, 100, rng=generator(3), leading=(20, 10)).reshape(
-        n, 3
-    )
+    centre = np.array([1.0, -2.0, 3.0])
+    x = draw(centre, FULL, 100, rng=generator(3), leading=(20, 10))
+    x = x.reshape(n, 3)
     # Var P̂_ij = (P_ij² + P_ii P_jj) / n of Gaussian draws.
-    error = np.sqrt((FULL**2 + np.outer(FULL.diagonal(), FULL.diagonal())) / n)
+    variances = FULL.diagonal()
+    error = np.sqrt((FULL**2 + np.outer(variances, variances)) / n)
     assert (np.abs(sample_covariance(x) - FULL) < 5 * error).all()
-    assert (np.abs(mean(x) - [1.0, -2.0, 3.0]) < 5 * np.sqrt(FULL.diagonal() / n)).all()
+    mean_error = np.sqrt(variances / n)
+    assert (np.abs(mean(x) - centre) < 5 * mean_error).all()
     # The squared length is chi-square: the shape is Gaussian too.
-    length = (
-        (x - [1.0, -2.0, 3.0]) * np.linalg.solve(FULL, (x - [1.0, -2.0, 3.0]).T).T
-    ).sum(-1)
+    deviation = x - centre
+    whitened = np.linalg.solve(FULL, deviation.T).T
+    length = (deviation * whitened).sum(-1)
     assert kstest(length, chi2(3).cdf).pvalue > 1e-4
 
 
 def test_draws_of_a_singular_covariance_stay_in_its_range() -> None:
-    x = draw(
-        [0.0, 5.0, 0.0],
-        np.outer([1.0, 0.0, 2.0], [1.0, 0.0, 2.0]),
-        50,
-        rng=generator(5),
-    )
-    assert (x[:, 1] == 5.0).all() and np.allclose(x[:, 2], 2 * x[:, 0], rtol=1e-12)
+    # P = a aᵀ: all draws are multiples of a, up to the mean.
+    a = np.array([1.0, 0.0, 2.0])
+    x = draw([0.0, 5.0, 0.0], np.outer(a, a), 50, rng=generator(5))
+    assert (x[:, 1] == 5.0).all()
+    assert np.allclose(x[:, 2], 2 * x[:, 0], rtol=1e-12)
     assert (draw([1.0], [[0.0]], 3, rng=generator()) == 1.0).all()
 
 
@@ -74,14 +77,17 @@ def test_draws_of_a_singular_covariance_stay_in_its_range() -> None:
 def _exact(avoid: np.ndarray, cov: np.ndarray, noise: np.ndarray) -> None:
     """Mean 0, no correlation with `avoid`, covariance `cov`: all to 1e-12."""
     std = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    # A component without noise is compared in absolute terms.
     std = np.where(std > 0, std, 1.0)
     assert np.abs(mean(noise) / std).max(initial=0) < 1e-12
     covariance = sample_covariance(noise)
-    assert unit_gap(covariance, np.broadcast_to(cov, covariance.shape)) < 1e-12
+    expected = np.broadcast_to(cov, covariance.shape)
+    assert relative_difference(covariance, expected) < 1e-12
     if avoid.shape[-1]:
         length = avoid.std(axis=-2, ddof=1)
         length = np.where(length > 0, length, 1.0)
-        correlation = center_ensemble(avoid)[1].mT @ noise / (avoid.shape[-2] - 1)
+        _, anomalies = center_ensemble(avoid)
+        correlation = anomalies.mT @ noise / (avoid.shape[-2] - 1)
         correlation /= length[..., :, None] * std[..., None, :]
         assert np.abs(correlation).max() < 1e-12
 
@@ -109,17 +115,21 @@ def test_exact_noise_beside_anomalies_that_depend_on_each_other(n: int) -> None:
     rng = generator(6)
     x = rng.standard_normal((3, n, 4))
     for slight in (0.0, 1e-12, 1e-9, 1e-6, 1e-3):
-        h = x @ rng.standard_normal((4, 8)) + slight * rng.standard_normal((3, n, 8))
+        linear = x @ rng.standard_normal((4, 8))
+        h = linear + slight * rng.standard_normal((3, n, 8))
         joint = np.concatenate([x, h], axis=-1)
         if n == 12 and slight:
-            with pytest.raises(
-                ValueError, match=r"must have more than 1[12] \+ 3 members.* got 12$"
-            ):
+            # Twelve independent anomalies leave no direction to twelve members.
+            text = r"must have more than 1[12] \+ 3 members.* got 12$"
+            with pytest.raises(ValueError, match=text):
                 exact_noise(joint, factor(FULL), rng)
         else:
-            _exact(joint, FULL, exact_noise(joint, factor(FULL), rng))
+            noise = exact_noise(joint, factor(FULL), rng)
+            _exact(joint, FULL, noise)
+    # Constant components and a copy at 1e6 add no anomaly.
     flat = np.concatenate([x, np.zeros((3, n, 2)), 1e6 + x[..., :1]], axis=-1)
-    _exact(flat[..., :6], FULL, exact_noise(flat, factor(FULL), rng))
+    noise = exact_noise(flat, factor(FULL), rng)
+    _exact(flat[..., :6], FULL, noise)
 
 
 def test_exact_noise_beside_combinations_of_close_anomalies() -> None:
@@ -128,25 +138,30 @@ def test_exact_noise_beside_combinations_of_close_anomalies() -> None:
         rng = generator(seed)
         x = rng.standard_normal((3, 7, 3))
         x[..., 1:] = x[..., :1] + 1e-3 * x[..., 1:]
-        joint = np.concatenate([x, x @ [[0.0, 1.0], [1.0, -1.0], [-1.0, 0.0]]], axis=-1)
-        _exact(joint, FULL, exact_noise(joint, factor(FULL), rng))
+        differences = x @ [[0.0, 1.0], [1.0, -1.0], [-1.0, 0.0]]
+        joint = np.concatenate([x, differences], axis=-1)
+        # Seven members: three anomalies, three components of noise, and the mean.
+        noise = exact_noise(joint, factor(FULL), rng)
+        _exact(joint, FULL, noise)
 
 
 def test_too_few_members_are_refused_with_the_number_needed() -> None:
     x = generator(7).standard_normal((9, 4))
+    # p anomalies, noise of rank r and the mean need N > p + r members.
     assert exact_noise(x[:8], factor(FULL), generator()).shape == (8, 3)
-    with pytest.raises(
-        ValueError, match=r"^ensemble must have more than 4 \+ 3 members"
-    ):
+    text = r"^ensemble must have more than 4 \+ 3 members"
+    with pytest.raises(ValueError, match=text):
         exact_noise(x[:7], factor(FULL), generator())
     rank_one = np.ones((3, 3))
     assert exact_noise(x[:6], factor(rank_one), generator()).shape == (6, 3)
-    assert (exact_noise(x[:5], factor(np.zeros((3, 3))), generator()) == 0).all()
+    zero = exact_noise(x[:5], factor(np.zeros((3, 3))), generator())
+    assert (zero == 0).all()
 
 
 def test_both_ways_give_the_same_draw(monkeypatch: pytest.MonkeyPatch) -> None:
     """Normal equations where they are safe, orthogonal bases where not: one projection."""
-    x = generator(8).standard_normal((5, 30, 4)) @ np.diag([1.0, 1e3, 1e-3, 1.0])
+    units = np.diag([1.0, 1e3, 1e-3, 1.0])
+    x = generator(8).standard_normal((5, 30, 4)) @ units
     # The fast way whitens by a Cholesky factor; without one QR takes its place.
     fast = exact_noise(x, factor(FULL), generator(9))
 
@@ -156,21 +171,23 @@ def test_both_ways_give_the_same_draw(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ensembles, "cholesky", fails)
     slow = exact_noise(x, factor(FULL), generator(9))
     assert np.allclose(fast, slow, rtol=0, atol=1e-12)
-    assert not np.allclose(fast, exact_noise(x, factor(FULL), generator(10)))
+    other_seed = exact_noise(x, factor(FULL), generator(10))
+    assert not np.allclose(fast, other_seed)
 
 
 def test_exact_noise_is_uniform_over_the_free_directions() -> None:
     """Each member has mean 0 and the variance of the projection."""
     rng = generator(12)
     x = rng.standard_normal((8, 2))
-    noise = exact_noise(np.broadcast_to(x, (20_000, 8, 2)), factor([[4.0]]), rng)[
-        ..., 0
-    ]
+    copies = np.broadcast_to(x, (20_000, 8, 2))
+    noise = exact_noise(copies, factor([[4.0]]), rng)[..., 0]
     # The draws lie in the complement of the constant and of both columns of x.
-    basis = np.linalg.qr(np.column_stack([np.ones(8), x]))[0]
+    basis, _ = np.linalg.qr(np.column_stack([np.ones(8), x]))
     projection = np.eye(8) - basis @ basis.T
     covariance = noise.T @ noise / 20_000
     # 7 · 4 is the squared length, spread evenly over 8 - 1 - 2 directions.
-    exact = 4.0 * 7 / 5 * projection
-    assert np.abs(covariance - exact).max() < 6 * 4.0 * 7 / 5 / np.sqrt(20_000)
-    assert np.abs(noise.mean(axis=0)).max() < 6 * np.sqrt(4.0 * 7 / 5 / 20_000)
+    variance = 4.0 * 7 / 5
+    expected = variance * projection
+    # Six standard errors
+    assert np.abs(covariance - expected).max() < 6 * variance / np.sqrt(20_000)
+    assert np.abs(noise.mean(axis=0)).max() < 6 * np.sqrt(variance / 20_000)

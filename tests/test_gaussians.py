@@ -16,7 +16,7 @@ from distfilt.gaussians import (
     intersection_weights,
 )
 from distfilt.gaussians.single import log_density, match_moments, unscented_points
-from tests.support import NAN, generator, spd, unit_gap, without_checks
+from tests.support import NAN, generator, relative_difference, spd, without_checks
 
 SEEDS = st.integers(0, 10_000)
 RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
@@ -37,7 +37,9 @@ def test_log_density_is_the_definition(seed: int, d: int) -> None:
     for i in range(3):
         exact = multivariate_normal(centre[i], cov[i]).logpdf(x[:, i])
         assert np.allclose(logs[:, i], exact, rtol=1e-9, atol=1e-9)
-    assert np.allclose(log_density(x, centre, cov[0])[..., 0], logs[:, 0])
+    # One covariance serves all centres.
+    shared = log_density(x, centre, cov[0])
+    assert np.allclose(shared[..., 0], logs[:, 0])
 
 
 # --- intersection -----------------------------------------------------------------------------
@@ -48,9 +50,12 @@ def _intersect_by_inverses(
 ) -> tuple[np.ndarray, np.ndarray]:
     """P⁻¹ = Σ ω P_b⁻¹ and P⁻¹ m = Σ ω P_b⁻¹ m_b."""
     information = np.linalg.inv(p)
-    cov = np.linalg.inv((w[..., None, None] * information).sum(axis=-3))
-    vector = (w[..., None] * (information @ m[..., None])[..., 0]).sum(axis=-2)
-    return (cov @ vector[..., None])[..., 0], cov
+    total = (w[..., None, None] * information).sum(axis=-3)
+    cov = np.linalg.inv(total)
+    vectors = (information @ m[..., None])[..., 0]
+    vector = (w[..., None] * vectors).sum(axis=-2)
+    mean_ = cov @ vector[..., None]
+    return mean_[..., 0], cov
 
 
 @given(SEEDS, st.integers(1, 5), st.integers(1, 5))
@@ -61,22 +66,22 @@ def test_intersection_is_the_weighted_sum_of_information(
     m = rng.standard_normal((6, s, d))
     p = spd(rng, d, (6, s))
     w = rng.dirichlet(np.ones(s), 6)
-    fused = intersect_gaussians(m, p, w)
+    means, covs = intersect_gaussians(m, p, w)
     # Rounding grows with the condition of the worst covariance.
-    exact = _intersect_by_inverses(m, p, w)
+    exact_means, exact_covs = _intersect_by_inverses(m, p, w)
     worst = 1e-13 * np.linalg.cond(p).max()
-    assert np.abs(fused[0] - exact[0]).max() < 10 * worst
-    assert unit_gap(fused[1], exact[1]) < worst
-    assert (fused[1] == fused[1].swapaxes(-1, -2)).all()
-    # A batch is the same as its members, and leading axes broadcast.
-    one = intersect_gaussians(m[2], p[2], w[2])
-    assert np.allclose(one[0], fused[0][2], atol=worst) and np.allclose(
-        one[1], fused[1][2]
-    )
-    several = intersect_gaussians(m[2], np.stack([p[2], 2 * p[2]]), w[2])
-    assert np.allclose(several[0], one[0], atol=worst) and np.allclose(
-        several[1][1], 2 * one[1]
-    )
+    assert np.abs(means - exact_means).max() < 10 * worst
+    assert relative_difference(covs, exact_covs) < worst
+    assert (covs == covs.swapaxes(-1, -2)).all()
+    # A batch is the same as its members.
+    single_mean, single_cov = intersect_gaussians(m[2], p[2], w[2])
+    assert np.allclose(single_mean, means[2], atol=worst)
+    assert np.allclose(single_cov, covs[2])
+    # Leading axes broadcast; twice all covariances give the same mean.
+    pair = np.stack([p[2], 2 * p[2]])
+    pair_means, pair_covs = intersect_gaussians(m[2], pair, w[2])
+    assert np.allclose(pair_means, single_mean, atol=worst)
+    assert np.allclose(pair_covs[1], 2 * single_cov)
 
 
 def test_intersection_of_the_same_or_one_source_changes_nothing() -> None:
@@ -84,11 +89,16 @@ def test_intersection_of_the_same_or_one_source_changes_nothing() -> None:
     m = 1e6 + rng.standard_normal(3)
     p = spd(rng, 3)
     mean_, cov = intersect_gaussians([m] * 4, [p] * 4, [0.1, 0.2, 0.3, 0.4])
-    assert np.allclose(mean_, m, rtol=1e-15, atol=0) and unit_gap(cov, p) < 1e-14
+    # Σ ω P⁻¹ = P⁻¹ for weights that sum to one
+    assert np.allclose(mean_, m, rtol=1e-15, atol=0)
+    assert relative_difference(cov, p) < 1e-14
+    # A single weight of one, on the first source and on the second
     mean_, cov = intersect_gaussians([m, 0 * m], [p, np.eye(3)], [1.0, 0.0])
-    assert (mean_ == m).all() and unit_gap(cov, p) < 1e-14
+    assert (mean_ == m).all()
+    assert relative_difference(cov, p) < 1e-14
     mean_, cov = intersect_gaussians([0 * m, m], [np.eye(3), p], [0.0, 1.0])
-    assert np.allclose(mean_, m, rtol=1e-14) and unit_gap(cov, p) < 1e-13
+    assert np.allclose(mean_, m, rtol=1e-14)
+    assert relative_difference(cov, p) < 1e-13
 
 
 def test_intersection_does_not_depend_on_units_or_order() -> None:
@@ -98,12 +108,14 @@ def test_intersection_does_not_depend_on_units_or_order() -> None:
     w = np.array([0.2, 0.5, 0.3])
     # Weights and result belong to the sources, in any units.
     size = np.array([1e-9, 1.0, 1e9, 1e3])
-    plain = intersect_gaussians(m, p, w)
-    scaled = intersect_gaussians(m * size, p * np.outer(size, size), w)
-    assert np.allclose(scaled[0], plain[0] * size, rtol=1e-11)
-    assert unit_gap(scaled[1], plain[1] * np.outer(size, size)) < 1e-12
-    turned = intersect_gaussians(m[::-1], p[::-1], w[::-1])
-    assert np.allclose(turned[0], plain[0]) and unit_gap(turned[1], plain[1]) < 1e-12
+    squares = np.outer(size, size)
+    mean_, cov = intersect_gaussians(m, p, w)
+    scaled_mean, scaled_cov = intersect_gaussians(m * size, p * squares, w)
+    assert np.allclose(scaled_mean, mean_ * size, rtol=1e-11)
+    assert relative_difference(scaled_cov, cov * squares) < 1e-12
+    reverse_mean, reverse_cov = intersect_gaussians(m[::-1], p[::-1], w[::-1])
+    assert np.allclose(reverse_mean, mean_)
+    assert relative_difference(reverse_cov, cov) < 1e-12
 
 
 def test_extreme_precision_does_not_spoil_the_rest() -> None:
@@ -112,14 +124,16 @@ def test_extreme_precision_does_not_spoil_the_rest() -> None:
     wide = spd(rng, 3)
     for order in (slice(None), slice(None, None, -1)):
         m = np.stack([np.ones(3), np.zeros(3)])[order]
-        mean_, cov = intersect_gaussians(m, np.stack([sharp, wide])[order], [0.5, 0.5])
-        assert np.allclose(mean_, 1.0) and unit_gap(cov, 2 * sharp) < 1e-9
-    # Components equal but for the last bit: along their sum both count, and rounding hides the
-    # other directions.
+        p = np.stack([sharp, wide])[order]
+        # The precise source decides: mean 1, covariance sharp / ω.
+        mean_, cov = intersect_gaussians(m, p, [0.5, 0.5])
+        assert np.allclose(mean_, 1.0)
+        assert relative_difference(cov, 2 * sharp) < 1e-9
+    # Components equal but for the last bit: along their sum both count, and rounding
+    # hides the other directions.
     nearly_equal = (1 + np.eye(2) * 2.0**-52) / 16
-    cov = intersect_gaussians(
-        np.zeros((2, 2)), [np.eye(2), nearly_equal], [0.75, 0.25]
-    )[1]
+    p = [np.eye(2), nearly_equal]
+    _, cov = intersect_gaussians(np.zeros((2, 2)), p, [0.75, 0.25])
     assert np.isclose(cov.sum(), 2 / (0.75 + 0.25 / 0.125))
 
 
@@ -140,48 +154,56 @@ def test_an_absent_source_has_weight_zero_for_any_values(rule: str) -> None:
         covs = np.where(present[..., None, None], p, junk)
         means = np.where(present[..., None], m, junk)
         w = without_checks(intersection_weights)(covs, rule=rule, present=present)
-        assert (w[~present] == 0).all() and np.allclose(w.sum(-1), 1.0, rtol=1e-14)
-        assert w[0, 2] == 1.0 and (w >= 0).all()
-        fused = without_checks(intersect_gaussians)(means, covs, w)
+        assert (w[~present] == 0).all()
+        assert (w >= 0).all()
+        assert np.allclose(w.sum(-1), 1.0, rtol=1e-14)
+        # The only source of the first row has all the weight.
+        assert w[0, 2] == 1.0
+        fused_means, fused_covs = without_checks(intersect_gaussians)(means, covs, w)
         for i in range(4):
-            single = intersection_weights(p[i][present[i]], rule=rule)
-            assert np.allclose(w[i][present[i]], single, atol=1e-6)
-            one = intersect_gaussians(
-                m[i][present[i]], p[i][present[i]], w[i][present[i]]
-            )
-            assert np.allclose(fused[0][i], one[0], atol=1e-11)
-            assert unit_gap(fused[1][i], one[1]) < 1e-11
+            # As if the absent sources were not in the list
+            k = present[i]
+            weights = intersection_weights(p[i][k], rule=rule)
+            assert np.allclose(w[i][k], weights, atol=1e-6)
+            mean_, cov = intersect_gaussians(m[i][k], p[i][k], w[i][k])
+            assert np.allclose(fused_means[i], mean_, atol=1e-11)
+            assert relative_difference(fused_covs[i], cov) < 1e-11
 
 
 def test_closed_forms() -> None:
-    p = np.stack([np.diag([1.0, 4.0]), np.diag([9.0, 1.0]), [[2.0, 1.0], [1.0, 2.0]]])
+    first = np.diag([1.0, 4.0])
+    second = np.diag([9.0, 1.0])
+    p = np.stack([first, second, [[2.0, 1.0], [1.0, 2.0]]])
     assert np.allclose(intersection_weights(p), THIRDS, rtol=1e-15)
     # Inverse traces, and inverse d-th roots of the determinants.
     traces = np.array([1 / 5, 1 / 10, 1 / 4])
-    assert np.allclose(
-        intersection_weights(p, rule="trace"), traces / traces.sum(), rtol=1e-14
-    )
+    w = intersection_weights(p, rule="trace")
+    assert np.allclose(w, traces / traces.sum(), rtol=1e-14)
     roots = np.array([1 / 2, 1 / 3, 1 / np.sqrt(3)])
-    assert np.allclose(
-        intersection_weights(p, rule="determinant"), roots / roots.sum(), rtol=1e-14
-    )
+    w = intersection_weights(p, rule="determinant")
+    assert np.allclose(w, roots / roots.sum(), rtol=1e-14)
     for rule in RULES:
         assert intersection_weights(p[:1], rule=rule).tolist() == [1.0]
+    # Equal weights of the present sources
     present = np.array([True, False, True])
-    assert intersection_weights(p, present=[present, ~present]).tolist() == [
-        [0.5, 0, 0.5],
-        [0, 1, 0],
-    ]
+    w = intersection_weights(p, present=[present, ~present])
+    assert w.tolist() == [[0.5, 0, 0.5], [0, 1, 0]]
+    # The determinants 1e-800 and 1e800 are no floats, their logarithms are.
     huge = np.stack([1e-200 * np.eye(4), 1e200 * np.eye(4)])
-    assert np.allclose(intersection_weights(huge, rule="determinant"), [1.0, 0.0])
+    w = intersection_weights(huge, rule="determinant")
+    assert np.allclose(w, [1.0, 0.0])
 
 
 def _slopes(w: np.ndarray, p: np.ndarray, rule: str) -> np.ndarray:
     """The derivatives of the documentation, by inverses."""
     information = np.linalg.inv(p)
-    cov = np.linalg.inv((w[:, None, None] * information).sum(axis=0))
-    right = cov @ information @ cov if rule == "min_trace" else cov @ information
-    return np.trace(right, axis1=-2, axis2=-1)
+    total = (w[:, None, None] * information).sum(axis=0)
+    cov = np.linalg.inv(total)
+    # -∂ log|P| / ∂ω_b = Tr(P P_b⁻¹), -∂ Tr P / ∂ω_b = Tr(P P_b⁻¹ P)
+    product = cov @ information
+    if rule == "min_trace":
+        product = product @ cov
+    return np.trace(product, axis1=-2, axis2=-1)
 
 
 @pytest.mark.parametrize("rule", ["min_trace", "min_determinant"])
@@ -195,13 +217,15 @@ def test_optimal_weights_meet_the_conditions_of_the_optimum(
     rule: str, seed: int, s: int, d: int, spread: float
 ) -> None:
     rng = generator(seed)
-    p = spd(rng, d, (s,)) * np.exp(spread * rng.standard_normal((s, 1, 1)))
+    scales = np.exp(spread * rng.standard_normal((s, 1, 1)))
+    p = spd(rng, d, (s,)) * scales
     w = intersection_weights(p, rule=rule)
     # g_b ≤ Σ ω g, with equality where ω_b > 0 (Karush, Kuhn and Tucker).
     slopes = _slopes(w, p, rule)
     average = float(w @ slopes)
     assert slopes.max() <= (1 + 2e-7) * average
     assert (w * (average - slopes) <= 2e-7 * average).all()
+    # Σ ω_b Tr(P P_b⁻¹) = Tr(P P⁻¹) = d
     if rule == "min_determinant":
         assert average == pytest.approx(d, rel=1e-9)
 
@@ -213,31 +237,35 @@ def test_monotone_steps_alone_reach_the_optimum(
     p = spd(generator(8), 3, (4, 3))
     exact = intersection_weights(p, rule="min_determinant")
 
-    def astray(weights: np.ndarray, *rest: object) -> np.ndarray:
-        return np.roll(weights, 1, axis=-1) ** 2 / (weights**2).sum(-1, keepdims=True)
+    def step_astray(weights: np.ndarray, *_: object) -> np.ndarray:
+        squares = np.roll(weights, 1, axis=-1) ** 2
+        return squares / squares.sum(-1, keepdims=True)
 
-    monkeypatch.setattr(intersection, "_newton_step", astray)
+    monkeypatch.setattr(intersection, "_newton_step", step_astray)
     monkeypatch.setattr(intersection, "_MAX_STEPS", 1500)
     for rule in ("min_determinant", "min_trace"):
         w = intersection_weights(p, rule=rule)
-        assert np.allclose(w.sum(-1), 1.0) and (w >= 0).all()
+        assert np.allclose(w.sum(-1), 1.0)
+        assert (w >= 0).all()
         for i in range(4):
-            best = _slopes(w[i], p[i], rule)
-            assert best.max() <= 1.001 * float(w[i] @ best)
-    assert np.allclose(
-        intersection_weights(p, rule="min_determinant"), exact, atol=0.02
-    )
+            slopes = _slopes(w[i], p[i], rule)
+            average = float(w[i] @ slopes)
+            assert slopes.max() <= 1.001 * average
+    w = intersection_weights(p, rule="min_determinant")
+    assert np.allclose(w, exact, atol=0.02)
 
 
 def test_optimal_weights_of_crossed_repeated_and_dominated_sources() -> None:
-    crossed = [np.diag([1.0, 4.0]), np.diag([4.0, 1.0])]
+    first = np.diag([1.0, 4.0])
+    second = np.diag([4.0, 1.0])
+    dominated = [np.eye(2), 1.01 * np.eye(2), 9 * np.eye(2)]
     for rule in ("min_trace", "min_determinant"):
-        better = intersection_weights(
-            [np.eye(2), 1.01 * np.eye(2), 9 * np.eye(2)], rule=rule
-        )
-        assert better[0] > 1 - 1e-4
-        twice = intersection_weights([crossed[0], crossed[0], crossed[1]], rule=rule)
-        assert np.allclose([twice[:2].sum(), twice[2]], 0.5, atol=1e-6)
+        # The smallest covariance takes all the weight.
+        w = intersection_weights(dominated, rule=rule)
+        assert w[0] > 1 - 1e-4
+        # By symmetry one half each; two copies share theirs.
+        w = intersection_weights([first, first, second], rule=rule)
+        assert np.allclose([w[:2].sum(), w[2]], 0.5, atol=1e-6)
 
 
 @pytest.mark.parametrize("bad", [NAN, np.inf])
@@ -253,9 +281,9 @@ def test_covariances_with_nan_are_refused_where_they_have_weight(
     for fuse in (intersect_gaussians, without_checks(intersect_gaussians)):
         with pytest.raises(ValueError, match="^covs must have finite numbers"):
             fuse(np.zeros((3, 2)), p, THIRDS)
-    cov = without_checks(intersect_gaussians)(
-        np.zeros((3, 2)), p, np.array([0.5, 0.0, 0.5])
-    )[1]
+    without_second = np.array([0.5, 0.0, 0.5])
+    fuse = without_checks(intersect_gaussians)
+    _, cov = fuse(np.zeros((3, 2)), p, without_second)
     assert np.isfinite(cov).all()
 
 
@@ -268,7 +296,8 @@ def test_optimal_weights_are_numbers_for_any_sizes(seed: int, power: float) -> N
     p = 0.5 * (p + p.swapaxes(-1, -2))
     for rule in RULES:
         w = intersection_weights(p, rule=rule)
-        assert (w >= 0).all() and np.allclose(w.sum(-1), 1.0, rtol=1e-12)
+        assert (w >= 0).all()
+        assert np.allclose(w.sum(-1), 1.0, rtol=1e-12)
 
 
 # --- matched moments --------------------------------------------------------------------------
@@ -278,9 +307,9 @@ def _ensembles(seed: int, n: int, d: int, leading: tuple[int, ...] = ()) -> np.n
     rng = generator(seed)
     mixing = rng.standard_normal((*leading, d, d))
     shift = 10 * rng.standard_normal((*leading, 1, d))
-    return (rng.standard_normal((*leading, n, d)) @ mixing + shift) * np.logspace(
-        -3, 3, d
-    )
+    normal = rng.standard_normal((*leading, n, d))
+    units = np.logspace(-3, 3, d)
+    return (normal @ mixing + shift) * units
 
 
 @given(SEEDS, st.integers(1, 13), st.integers(1, 30))
@@ -296,23 +325,24 @@ def test_matched_moments_are_exact(seed: int, d: int, more: int) -> None:
         assert "singular" in str(error) or "definite" in str(error)
         return
     std = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    # Members far from zero are rounded to 1e-16 of their distance.
     rounding = 1e-15 * (np.abs(centre) / std).max()
-    assert np.abs((mean(matched) - centre) / std).max() < 1e-13 + 10 * rounding
-    assert unit_gap(sample_covariance(matched), cov) < 1e-13 + 100 * rounding
+    mean_error = (mean(matched) - centre) / std
+    assert np.abs(mean_error).max() < 1e-13 + 10 * rounding
+    cov_error = relative_difference(sample_covariance(matched), cov)
+    assert cov_error < 1e-13 + 100 * rounding
 
 
 def test_moments_are_exact_if_both_covariances_are_ill_conditioned() -> None:
     """A product of inverses and roots once lost nine digits here."""
     rng = generator(31)
     for d in (3, 12):
-        flat = (
-            np.diag(np.logspace(0, -7, d))
-            @ np.linalg.qr(rng.standard_normal((d, d)))[0]
-        )
+        rotation, _ = np.linalg.qr(rng.standard_normal((d, d)))
+        flat = np.diag(np.logspace(0, -7, d)) @ rotation
         e = rng.standard_normal((60, d)) @ flat
         target = spd(rng, d, least=1e-10)
         matched = match_moments(e, np.zeros(d), target)
-        assert unit_gap(sample_covariance(matched), target) < 1e-13
+        assert relative_difference(sample_covariance(matched), target) < 1e-13
 
 
 def test_matching_moments_is_symmetric_and_so_optimal_transport() -> None:
@@ -321,20 +351,25 @@ def test_matching_moments_is_symmetric_and_so_optimal_transport() -> None:
     other = _ensembles(2, 40, 4)
     cov = sample_covariance(other)
     unit = np.sqrt(cov.diagonal())
-    # The map A of the anomalies, from their least squares, is symmetric positive definite.
-    a = np.linalg.lstsq(
-        e - mean(e), match_moments(e, mean(e), cov) - mean(e), rcond=None
-    )[0].T
+    # The map A of the anomalies, from their least squares, is symmetric positive
+    # definite.
+    centre = mean(e)
+    matched = match_moments(e, centre, cov)
+    solution = np.linalg.lstsq(e - centre, matched - centre, rcond=None)
+    a = solution[0].T
     a *= unit / unit[:, None]
     assert np.abs(a - a.T).max() < 1e-9 * np.abs(a).max()
-    assert (np.linalg.eigvalsh(0.5 * (a + a.T)) > 0).all()
+    symmetric = 0.5 * (a + a.T)
+    assert (np.linalg.eigvalsh(symmetric) > 0).all()
 
 
 def test_leading_axes_of_a_target_broadcast_or_are_refused_by_name() -> None:
     e = _ensembles(4, 9, 2, (3,))
     cov = np.stack([np.eye(2)] * 3)
-    many = match_moments(e[0], np.arange(6.0).reshape(3, 2), np.eye(2))
-    assert many.shape == (3, 9, 2) and np.allclose(mean(many), [[0, 1], [2, 3], [4, 5]])
+    centres = np.arange(6.0).reshape(3, 2)
+    many = match_moments(e[0], centres, np.eye(2))
+    assert many.shape == (3, 9, 2)
+    assert np.allclose(mean(many), centres)
     with pytest.raises(ValueError, match="^mean must have leading axes that broadcast"):
         match_moments(e, np.zeros((4, 2)), cov)
     with pytest.raises(ValueError, match="^cov must have leading axes that broadcast"):
@@ -344,18 +379,15 @@ def test_leading_axes_of_a_target_broadcast_or_are_refused_by_name() -> None:
 def test_flat_ensembles_are_refused_wherever_they_lie() -> None:
     rng = generator(12)
     x = rng.standard_normal((20, 3))
-    for flat in (
-        x @ [[1, 0, 1], [0, 1, 1], [0, 0, 0]],
-        x * [1, 0, 1],
-        1e9 + x * [1, 1e-9, 1],
-    ):
+    means = np.zeros((2, 3))
+    covs = np.stack([np.eye(3)] * 2)
+    # A component that is a sum, a constant one, and one of rounding
+    combined = x @ [[1, 0, 1], [0, 1, 1], [0, 0, 0]]
+    for flat in (combined, x * [1, 0, 1], 1e9 + x * [1, 1e-9, 1]):
         for shift in (0.0, 1e6):
+            ensembles = np.stack([x, flat + shift])
             with pytest.raises(ValueError, match="^ensemble must .* singular"):
-                match_moments(
-                    np.stack([x, flat + shift]),
-                    np.zeros((2, 3)),
-                    np.stack([np.eye(3)] * 2),
-                )
+                match_moments(ensembles, means, covs)
 
 
 # --- unscented points -------------------------------------------------------------------------
@@ -367,22 +399,26 @@ def test_points_have_the_moments(d: int, kappa: float) -> None:
     rng = generator(d)
     mean = rng.standard_normal((4, d))
     cov = spd(rng, d, (4,))
-    root = np.linalg.cholesky(cov) @ np.linalg.qr(rng.standard_normal((d, d)))[0]
+    rotation, _ = np.linalg.qr(rng.standard_normal((d, d)))
+    root = np.linalg.cholesky(cov) @ rotation
     points, w = unscented_points(mean, root, kappa=kappa)
-    assert points.shape == (4, 2 * d + 1, d) and np.isclose(w.sum(), 1)
+    assert points.shape == (4, 2 * d + 1, d)
+    assert np.isclose(w.sum(), 1)
     # Σ w x = m and Σ w (x - m)(x - m)ᵀ = P, for any square root.
     assert np.allclose(w @ points, mean)
-    innovation = points - mean[:, None]
-    assert np.allclose((innovation * w[:, None]).mT @ innovation, cov)
-    assert np.allclose(points[:, 0], mean) and np.allclose(
-        points[:, 1:].mean(axis=1), mean
-    )
+    deviation = points - mean[:, None]
+    second_moment = (deviation * w[:, None]).mT @ deviation
+    assert np.allclose(second_moment, cov)
+    # The mean itself comes first, the other points lie symmetrically around it.
+    assert np.allclose(points[:, 0], mean)
+    assert np.allclose(points[:, 1:].mean(axis=1), mean)
 
 
 def test_fourth_moments_along_an_axis_are_a_gaussians() -> None:
     points, w = unscented_points(np.zeros(4), np.eye(4), kappa=-1.0)
     # E z⁴ = 3 and E z³ = 0 with κ = 3 - d.
-    assert np.allclose(w @ points**4, 3.0) and np.allclose(w @ points**3, 0.0)
+    assert np.allclose(w @ points**4, 3.0)
+    assert np.allclose(w @ points**3, 0.0)
 
 
 # --- conditioning -----------------------------------------------------------------------------
@@ -392,16 +428,14 @@ M = 3
 
 
 def case(seed: int, lead: tuple[int, ...] = ()) -> tuple[np.ndarray, ...]:
+    """Return mean, covariance, innovation, observation matrix and noise covariance."""
     rng = np.random.default_rng(seed)
     mean = rng.standard_normal((*lead, D))
     innovation = rng.standard_normal((*lead, M))
-    return (
-        mean,
-        spd(rng, D, lead),
-        innovation,
-        rng.standard_normal((*lead, M, D)),
-        spd(rng, M, lead),
-    )
+    cov = spd(rng, D, lead)
+    h = rng.standard_normal((*lead, M, D))
+    r = spd(rng, M, lead)
+    return mean, cov, innovation, h, r
 
 
 @given(seed=st.integers(0, 10**6))
@@ -410,11 +444,11 @@ def test_in_information_form_an_update_is_a_sum(seed: int) -> None:
     x, p = condition(mean, cov, innovation, h, r)
     # P⁺⁻¹ = P⁻¹ + Hᵀ R⁻¹ H and m⁺ = m + P⁺ Hᵀ R⁻¹ d
     weight = h.T @ np.linalg.inv(r)
-    exact = np.linalg.inv(np.linalg.inv(cov) + weight @ h)
+    information = np.linalg.inv(cov) + weight @ h
+    exact = np.linalg.inv(information)
     np.testing.assert_allclose(p, exact, rtol=1e-8, atol=1e-9)
-    np.testing.assert_allclose(
-        x, mean + exact @ weight @ innovation, rtol=1e-8, atol=1e-8
-    )
+    expected = mean + exact @ weight @ innovation
+    np.testing.assert_allclose(x, expected, rtol=1e-8, atol=1e-8)
     assert (p == p.T).all()
 
 
@@ -422,26 +456,22 @@ def test_a_missing_component_is_a_row_left_out() -> None:
     mean, cov, complete, h, r = case(1)
     for lost, remaining in ((1, [0, 2]), (0, [1, 2])):
         innovation = np.where(np.arange(M) == lost, np.nan, complete)
-        ours = [
-            both[0]
-            for both in condition(mean, cov, innovation, h, np.stack([r, 2 * r]))
-        ]
-        theirs = condition(
-            mean,
-            cov,
-            innovation[remaining],
-            h[remaining],
-            r[np.ix_(remaining, remaining)],
-        )
-        for a, b in zip(ours, theirs, strict=True):
-            np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
-    blind = condition(mean, cov, np.full(M, np.nan), h, r)
-    assert (blind[0] == mean).all() and (blind[1] == cov).all()
+        # In a batch of two noises, of which the first is r
+        means, covs = condition(mean, cov, innovation, h, np.stack([r, 2 * r]))
+        block = r[np.ix_(remaining, remaining)]
+        x, p = condition(mean, cov, innovation[remaining], h[remaining], block)
+        np.testing.assert_allclose(means[0], x, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(covs[0], p, rtol=0, atol=1e-13)
+    # Without any observation the prior stays, to the bit.
+    x, p = condition(mean, cov, np.full(M, np.nan), h, r)
+    assert (x == mean).all()
+    assert (p == cov).all()
 
 
 def test_a_batch_is_its_members_one_by_one() -> None:
     mean, cov, innovation, h, r = case(2, (5, 2))
-    innovation[np.random.default_rng(3).random(innovation.shape) < 0.3] = np.nan
+    uniform = np.random.default_rng(3).random(innovation.shape)
+    innovation[uniform < 0.3] = np.nan
     x, p = condition(mean, cov, innovation, h, r)
     for k in np.ndindex(5, 2):
         single = condition(mean[k], cov[k], innovation[k], h[k], r[k])
@@ -453,16 +483,21 @@ def test_one_covariance_and_one_sensor_serve_any_number_of_means() -> None:
     mean, innovation = np.random.default_rng(4).standard_normal((2, 6, D))
     _, cov, _, h, r = case(5)
     x, p = condition(mean, cov, innovation[:, :M], h, r)
-    assert x.shape == (6, D) and p.shape == (D, D)
-    full = condition(mean, np.broadcast_to(cov, (6, D, D)), innovation[:, :M], h, r)
-    np.testing.assert_allclose(x, full[0], rtol=0, atol=1e-13)
-    np.testing.assert_allclose(
-        np.broadcast_to(p, full[1].shape), full[1], rtol=0, atol=1e-13
-    )
+    assert x.shape == (6, D)
+    # P⁺ does not depend on the means: one is computed for all.
+    assert p.shape == (D, D)
+    covs = np.broadcast_to(cov, (6, D, D))
+    full_x, full_p = condition(mean, covs, innovation[:, :M], h, r)
+    np.testing.assert_allclose(x, full_x, rtol=0, atol=1e-13)
+    shared = np.broadcast_to(p, full_p.shape)
+    np.testing.assert_allclose(shared, full_p, rtol=0, atol=1e-13)
 
 
 def test_joseph_s_form_is_accurate_for_a_nearly_exact_observation() -> None:
     """The posterior variance of an observed component is R, sixteen digits below P."""
     mean, cov, innovation, _, _ = case(7)
-    p = condition(mean, 1e8 * cov, innovation, np.eye(D)[:M], 1e-8 * np.eye(M))[1]
-    np.testing.assert_allclose(p[:M, :M], 1e-8 * np.eye(M), rtol=1e-6, atol=1e-13)
+    h = np.eye(D)[:M]
+    r = 1e-8 * np.eye(M)
+    # P - K S Kᵀ would subtract numbers of 1e8 to leave 1e-8.
+    _, p = condition(mean, 1e8 * cov, innovation, h, r)
+    np.testing.assert_allclose(p[:M, :M], r, rtol=1e-6, atol=1e-13)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,7 +12,7 @@ from hypothesis import strategies as st
 from distfilt import linalg
 from distfilt.derivatives import central_difference
 from distfilt.sensors import wrap
-from tests.support import generator, singular, spd, unit_gap, without_checks
+from tests.support import generator, relative_difference, singular, spd, without_checks
 
 SEEDS = st.integers(0, 10_000)
 SIZES = st.integers(1, 7)
@@ -42,11 +44,13 @@ def test_factor_reproduces_its_matrix(seed: int, d: int) -> None:
     cov = spd(generator(seed), d, (2, 3))
     lower = linalg.factor(cov)
     # L Lᵀ = P to rounding, triangular with a positive diagonal.
-    assert unit_gap(lower @ _transpose(lower), cov) < 10 * d * EPS
-    assert (np.triu(lower, 1) == 0).all() and (
-        np.diagonal(lower, axis1=-2, axis2=-1) > 0
-    ).all()
-    assert np.allclose(linalg.factor(cov[1, 2]), lower[1, 2], rtol=1e-10, atol=1e-12)
+    assert relative_difference(lower @ _transpose(lower), cov) < 10 * d * EPS
+    assert (np.triu(lower, 1) == 0).all()
+    diagonals = np.diagonal(lower, axis1=-2, axis2=-1)
+    assert (diagonals > 0).all()
+    # A matrix of the stack has the factor that it has by itself.
+    single = linalg.factor(cov[1, 2])
+    assert np.allclose(single, lower[1, 2], rtol=1e-10, atol=1e-12)
 
 
 @given(SEEDS, st.integers(2, 7), st.data())
@@ -60,8 +64,9 @@ def test_factor_of_a_singular_matrix_keeps_every_digit(
     cov = singular(rng, d, rank) * size[:, None] * size
     cov = 0.5 * (cov + cov.T)
     lower = linalg.factor(cov)
-    assert unit_gap(lower @ lower.T, cov) < 50 * d * EPS
-    assert (np.triu(lower, 1) == 0).all() and (np.diagonal(lower) >= 0).all()
+    assert relative_difference(lower @ lower.T, cov) < 50 * d * EPS
+    assert (np.triu(lower, 1) == 0).all()
+    assert (np.diagonal(lower) >= 0).all()
 
 
 @pytest.mark.parametrize("nearly", [1e-7, 3e-8, 1e-8, 1e-9])
@@ -73,12 +78,12 @@ def test_factor_where_a_tiny_pivot_decides(nearly: float) -> None:
     """
     third = np.array([0.0, nearly, 1.0])
     for k in range(20):
-        first = generator(k).uniform(0.5, 2.0) * np.array(
-            [1.0, generator(k).uniform(0.5, 2), 0.3]
-        )
+        scale = generator(k).uniform(0.5, 2.0)
+        first = scale * np.array([1.0, scale, 0.3])
+        # Rank two: the third pivot is zero in exact arithmetic.
         cov = np.outer(first, first) + np.outer(third, third)
         lower = linalg.factor(cov)
-        assert unit_gap(lower @ lower.T, cov) < 150 * EPS
+        assert relative_difference(lower @ lower.T, cov) < 150 * EPS
         assert (np.triu(lower, 1) == 0).all()
 
 
@@ -93,18 +98,23 @@ def test_factor_is_unique_where_a_component_is_still(
     lower = linalg.factor(cov)
     # The other components have the Cholesky factor of their own covariance.
     others = np.arange(d) != k
-    plain = np.linalg.cholesky(cov[np.ix_(others, others)])
-    assert np.allclose(lower[np.ix_(others, others)], plain, rtol=1e-9, atol=1e-12)
-    assert (lower[k] == 0).all() and (lower[:, k] == 0).all()
+    block = np.ix_(others, others)
+    plain = np.linalg.cholesky(cov[block])
+    assert np.allclose(lower[block], plain, rtol=1e-9, atol=1e-12)
+    assert (lower[k] == 0).all()
+    assert (lower[:, k] == 0).all()
 
 
 def test_factor_of_nothing_and_of_a_mixed_stack() -> None:
     assert (linalg.factor(np.zeros((2, 3, 3))) == 0).all()
-    mixed = np.stack([spd(generator(), 3), np.ones((3, 3)), np.diag([0.0, 4.0, 0.0])])
+    # Definite, of rank one, and diagonal with zeros
+    definite = spd(generator(), 3)
+    mixed = np.stack([definite, np.ones((3, 3)), np.diag([0.0, 4.0, 0.0])])
     lower = linalg.factor(mixed)
-    assert unit_gap(lower @ _transpose(lower), mixed) < 100 * EPS
+    assert relative_difference(lower @ _transpose(lower), mixed) < 100 * EPS
     assert np.allclose(lower[1], [[1, 0, 0], [1, 0, 0], [1, 0, 0]])
-    assert lower[2, 1, 1] == 2 and np.count_nonzero(lower[2]) == 1
+    assert lower[2, 1, 1] == 2
+    assert np.count_nonzero(lower[2]) == 1
 
 
 # --- solves -----------------------------------------------------------------------------------
@@ -119,31 +129,32 @@ def test_triangular_solves_of_every_number_of_systems(
     leading: tuple[int, ...], d: int
 ) -> None:
     rng = generator(d)
-    lower = np.linalg.cholesky(cov := spd(rng, d, leading))
+    cov = spd(rng, d, leading)
+    lower = np.linalg.cholesky(cov)
     right = rng.standard_normal((*leading, d, 3))
-    assert all(
-        np.allclose(s * cov @ linalg.solve_definite(s * cov, right), right)
-        for s in (1, -1)
-    )
-    lower.flags.writeable = right.flags.writeable = False
+    # A negative definite matrix has no Cholesky factor and is solved otherwise.
+    for sign in (1, -1):
+        solution = linalg.solve_definite(sign * cov, right)
+        assert np.allclose(sign * cov @ solution, right)
+    # Neither argument is written to.
+    lower.flags.writeable = False
+    right.flags.writeable = False
+    first = (0,) * len(leading)
+    is_close = partial(np.allclose, rtol=1e-11, atol=1e-11)
     for solve, matrix in (
         (linalg.solve_lower, lower),
         (linalg.solve_upper, _transpose(lower)),
     ):
+        # A solution for each system
         solution = solve(lower, right)
         assert solution.shape == right.shape
-        assert np.allclose(matrix @ solution, right, rtol=1e-11, atol=1e-11)
-        shared = solve(lower, right[(0,) * len(leading)])
-        assert np.allclose(
-            matrix @ shared, right[(0,) * len(leading)], rtol=1e-11, atol=1e-11
-        )
-    one = lower[(0,) * len(leading)]
-    assert np.allclose(
-        one @ linalg.solve_lower(one, right), right, rtol=1e-11, atol=1e-11
-    )
-    assert np.allclose(
-        one.T @ linalg.solve_upper(one, right), right, rtol=1e-11, atol=1e-11
-    )
+        assert is_close(matrix @ solution, right)
+        # One right side for all matrices
+        solution = solve(lower, right[first])
+        assert is_close(matrix @ solution, right[first])
+        # One matrix for all right sides
+        solution = solve(lower[first], right)
+        assert is_close(matrix[first] @ solution, right)
 
 
 @pytest.mark.parametrize("leading", LEADING)
@@ -153,15 +164,19 @@ def test_whitening_broadcasts_in_every_way(leading: tuple[int, ...]) -> None:
     for shape in ((*leading, 4), (4,)):
         v = rng.standard_normal(shape)
         solution = linalg.whiten(lower, v)
-        assert np.allclose(
-            (lower @ solution[..., None])[..., 0], np.broadcast_to(v, solution.shape)
-        )
+        product = (lower @ solution[..., None])[..., 0]
+        assert np.allclose(product, np.broadcast_to(v, solution.shape))
     many = rng.standard_normal((*leading, 7, 4))
-    solution = linalg.whiten(lower[..., None, :, :], many)
+    # Each factor for seven vectors, then the first factor for all
+    per_system = lower[..., None, :, :]
+    solution = linalg.whiten(per_system, many)
     assert solution.shape == many.shape
-    assert np.allclose((lower[..., None, :, :] @ solution[..., None])[..., 0], many)
-    solution = linalg.whiten(lower[(0,) * len(leading)], many)
-    assert np.allclose((lower[(0,) * len(leading)] @ solution[..., None])[..., 0], many)
+    product = (per_system @ solution[..., None])[..., 0]
+    assert np.allclose(product, many)
+    first = lower[(0,) * len(leading)]
+    solution = linalg.whiten(first, many)
+    product = (first @ solution[..., None])[..., 0]
+    assert np.allclose(product, many)
 
 
 @pytest.mark.parametrize("leading", [(), (0,), (3,), (0, 2)])
@@ -172,10 +187,8 @@ def test_empty_systems(leading: tuple[int, ...], d: int, k: int) -> None:
     assert _solve(cov, right).shape == right.shape
     assert _length(cov, np.ones((*leading, d))).shape == leading
     assert _length(np.eye(d), np.ones((*leading, d))).shape == leading
-    assert (
-        without_checks(linalg.factor)(cov).shape == cov.shape
-        and _log_det(cov).shape == leading
-    )
+    assert without_checks(linalg.factor)(cov).shape == cov.shape
+    assert _log_det(cov).shape == leading
 
 
 @given(SEEDS, SIZES, st.sampled_from(LEADING))
@@ -186,7 +199,8 @@ def test_solves_agree_with_numpy(seed: int, d: int, leading: tuple[int, ...]) ->
     # vᵀ P⁻¹ v and log |P|, as numpy's general routines give them.
     worst = 1e-13 * np.linalg.cond(cov).max()
     plain = np.linalg.solve(cov, v[..., None])[..., 0]
-    assert np.allclose(_length(cov, v), (v * plain).sum(-1), rtol=worst)
+    lengths = (v * plain).sum(-1)
+    assert np.allclose(_length(cov, v), lengths, rtol=worst)
     logs = np.linalg.slogdet(cov)[1]
     assert np.allclose(_log_det(cov), logs, rtol=1e-11, atol=1e-11)
 

@@ -28,9 +28,8 @@ def test_leading_axes_broadcast():
     scores = crps(estimates, truth)
     for r in range(7):
         for a in range(3):
-            assert np.allclose(
-                scores[r, a], crps(estimates[r, a], truth[r, 0]), rtol=1e-12
-            )
+            expected = crps(estimates[r, a], truth[r, 0])
+            assert np.allclose(scores[r, a], expected, rtol=1e-12)
 
 
 # --- consistency ------------------------------------------------------------------------------
@@ -42,12 +41,16 @@ def test_nees_and_nis_are_their_definitions(leading):
     estimate, truth = rng.standard_normal((2, *leading, 4))
     cov = spd(rng, 4, leading)
     error = estimate - truth
-    exact = (error * np.linalg.solve(cov, error[..., None])[..., 0]).sum(-1)
+    # eᵀ P⁻¹ e
+    whitened = np.linalg.solve(cov, error[..., None])[..., 0]
+    exact = (error * whitened).sum(-1)
     assert nees(estimate, cov, truth).shape == leading
     assert np.allclose(nees(estimate, cov, truth), exact, rtol=1e-10)
     assert np.allclose(nis(error, cov), exact, rtol=1e-10)
+    # One covariance for all estimates
     one = cov[(0,) * len(leading)]
-    exact = (error * np.linalg.solve(one, error[..., None])[..., 0]).sum(-1)
+    whitened = np.linalg.solve(one, error[..., None])[..., 0]
+    exact = (error * whitened).sum(-1)
     assert np.allclose(nees(estimate, one, truth), exact, rtol=1e-10)
     with pytest.raises(ValueError, match="^truth must have leading axes"):
         nees(np.ones((2, 4)), one, np.ones((3, 4)))
@@ -60,16 +63,16 @@ def test_nees_band_has_its_probability(dim, runs, level):
     band = nees_band(dim, runs, level=level)
     # The sum of n NEES values is chi-square with n d degrees of freedom.
     law = stats.chi2(dim * runs)
-    assert law.cdf(band.high * runs) - law.cdf(band.low * runs) == pytest.approx(
-        level, abs=1e-10
-    )
+    probability = law.cdf(band.high * runs) - law.cdf(band.low * runs)
+    assert probability == pytest.approx(level, abs=1e-10)
+    # Divided by d, with the expected value 1
     unit = nees_band(dim, runs, level=level, normalised=True)
-    assert np.allclose(
-        [unit.low, unit.high, unit.error],
-        np.array([band.low, band.high, band.error]) / dim,
-        rtol=1e-12,
-    )
-    assert dim in band and 1 in unit
+    normalised = [unit.low, unit.high, unit.error]
+    expected = np.array([band.low, band.high, band.error]) / dim
+    assert np.allclose(normalised, expected, rtol=1e-12)
+    assert dim in band
+    assert 1 in unit
+    # Var χ²_d = 2 d
     assert band.error == pytest.approx(np.sqrt(2 * dim / runs), rel=1e-12)
 
 
@@ -84,7 +87,8 @@ def test_gaussian_crps_equals_its_integral(mean, std, truth):
     # ∫ (F(u) - 1{u ≥ y})² du, below and above the truth y.
     below, _ = quad(lambda u: cdf(u) ** 2, mean - 12 * std, truth, epsabs=1e-12)
     above, _ = quad(lambda u: (1 - cdf(u)) ** 2, truth, mean + 12 * std, epsabs=1e-12)
-    assert gaussian_crps(mean, std, truth) == pytest.approx(below + above, abs=1e-9)
+    score = gaussian_crps(mean, std, truth)
+    assert score == pytest.approx(below + above, abs=1e-9)
 
 
 @pytest.mark.parametrize("n", [1, 2, 50])
@@ -93,15 +97,17 @@ def test_crps_is_its_definition(n):
     x = rng.standard_normal((3, n, 2))
     y = rng.standard_normal((3, 2))
     w = rng.dirichlet([1] * n, 3)
-    interval = crps(x, y, weights=w)
+    scores = crps(x, y, weights=w)
     for r in range(3):
         for k in range(2):
             a = x[r, :, k]
-            pairs = (w[r] * np.abs(a[:, None] - a) * w[r][:, None]).sum()
-            exact = (w[r] * np.abs(a - y[r, k])).sum() - pairs / 2
-            assert interval[r, k] == pytest.approx(exact, abs=1e-13)
-    equal = np.full(n, 1 / n)
-    assert np.allclose(crps(x, y, weights=[equal] * 3), crps(x, y), atol=1e-13)
+            # E|X - y| - ½ E|X - X'|
+            distances = np.abs(a[:, None] - a)
+            pairs = w[r] @ distances @ w[r]
+            exact = w[r] @ np.abs(a - y[r, k]) - pairs / 2
+            assert scores[r, k] == pytest.approx(exact, abs=1e-13)
+    equal = [np.full(n, 1 / n)] * 3
+    assert np.allclose(crps(x, y, weights=equal), crps(x, y), atol=1e-13)
 
 
 # --- intervals --------------------------------------------------------------------------------
@@ -112,15 +118,21 @@ def test_crps_is_its_definition(n):
 def test_intervals_are_those_of_scipy(n, level):
     values = np.random.default_rng(n).standard_normal(n) ** 3
     interval = mean_interval(values, level=level)
-    exact = stats.t.interval(level, n - 1, values.mean(), stats.sem(values))
+    standard_error = stats.sem(values)
+    exact = stats.t.interval(level, n - 1, values.mean(), standard_error)
     assert (interval.low, interval.high) == pytest.approx(exact, rel=1e-12)
-    assert interval.error == pytest.approx(stats.sem(values), rel=1e-12)
+    assert interval.error == pytest.approx(standard_error, rel=1e-12)
     for k in sorted({0, 1, n // 3, n - 1, n}):
         ours = proportion_interval(k, n, level=level)
         theirs = stats.binomtest(k, n).proportion_ci(level, method="exact")
-        # scipy searches these roots; the quantiles of the beta distribution are the roots.
+        # scipy searches these roots; the quantiles of the beta distribution are the
+        # roots.
         assert (ours.low, ours.high) == pytest.approx(tuple(theirs), abs=1e-11)
-        assert ours.error == pytest.approx(np.sqrt(k / n * (1 - k / n) / n), rel=1e-12)
+        # √(p (1 - p) / n)
+        p = k / n
+        standard_error = np.sqrt(p * (1 - p) / n)
+        assert ours.error == pytest.approx(standard_error, rel=1e-12)
+    # The range of n values covers the median with a probability of 1 - 2^(1 - n) only.
     if n >= 8 and (n > 8 or level < 0.99):
         ours = median_interval(values, level=level)
         theirs = stats.quantile_test(values).confidence_interval(level)
@@ -130,12 +142,9 @@ def test_intervals_are_those_of_scipy(n, level):
 
 def test_values_that_are_all_alike():
     interval = mean_interval([2.0, 2.0, 2.0])
-    assert (interval.estimate, interval.low, interval.high, interval.error) == (
-        2.0,
-        2.0,
-        2.0,
-        0.0,
-    )
+    assert interval.estimate == 2.0
+    assert (interval.low, interval.high) == (2.0, 2.0)
+    assert interval.error == 0.0
 
 
 def test_tiny_levels_keep_the_estimate_inside():
@@ -146,20 +155,23 @@ def test_tiny_levels_keep_the_estimate_inside():
 
 def test_median_interval_error_tends_to_the_standard_error():
     values = stats.norm.ppf((np.arange(100000) + 0.5) / 100000)
-    exact = np.sqrt(np.pi / 2 / 100000)  # asymptotic, Gaussian
+    # 1 / (2 f(m) √n) with the Gaussian density f(m) = 1/√(2 π)
+    exact = np.sqrt(np.pi / 2 / 100000)
     assert median_interval(values).error == pytest.approx(exact, rel=0.01)
 
 
 def test_interval_is_compact_and_holds_its_ends():
     interval = Interval(1.23456, 1.1, 1.4, 0.05)
     assert str(interval) == "1.23 [1.1, 1.4]"
-    assert 1.1 in interval and 1.4 in interval and 1.41 not in interval
+    assert 1.1 in interval
+    assert 1.4 in interval
+    assert 1.41 not in interval
 
 
 def test_too_few_values_are_refused():
     with pytest.raises(ValueError, match="^values must have at least 2"):
         mean_interval([1.0])
-    with pytest.raises(
-        ValueError, match="^values must have more values for level 0.95"
-    ):
+    # The range of five values covers the median with 1 - 2^(-4) = 0.9375.
+    text = "^values must have more values for level 0.95"
+    with pytest.raises(ValueError, match=text):
         median_interval([1.0, 2.0, 3.0, 4.0, 5.0])

@@ -106,6 +106,7 @@ def check_refusals(call: Call, argument: str, label: str) -> None:
         with pytest.raises(ValueError) as caught:
             call.run(**{argument: value})
         assert str(caught.value).startswith(argument), f"{label}: {caught.value}"
+        # A refused call has not written to its other arguments, either.
         assert exact(before, call.arguments)
 
 

@@ -34,5 +34,6 @@ def mend(page: Path) -> None:
     for old, new in MENDS:
         text = text.replace(old, new)
     text = BRAND.sub('<div class="sidebar-primary-item" role="banner">', text)
+    # An unchanged page keeps its date.
     if text != before:
         page.write_text(text, encoding="utf-8")

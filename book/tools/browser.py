@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+# A container has no user namespace for the sandbox and little shared memory; the
+# browser must ask for nothing by itself.
 FLAGS = (
     "--headless=new",
     "--no-sandbox",
@@ -47,6 +49,7 @@ def chromium(profile: Path, **logs: str) -> Iterator[Any]:
     from selenium.webdriver.chrome.options import Options
     from selenium.webdriver.chrome.service import Service
 
+    # A profile of its own: a running browser would lock a common one.
     options = Options()
     options.binary_location = paths[0]
     for flag in (*FLAGS, f"--user-data-dir={profile}"):
@@ -54,6 +57,7 @@ def chromium(profile: Path, **logs: str) -> Iterator[Any]:
     options.set_capability("goog:loggingPrefs", logs)
     driver = webdriver.Chrome(options=options, service=Service(paths[1]))
     try:
+        # Without quit the browser outlives an exception.
         yield driver
     finally:
         driver.quit()

@@ -35,6 +35,7 @@ def fixed_environment() -> dict[str, str]:
     """
     home = ROOT / "_build" / "jupyter"
     (home / "ipython").mkdir(parents=True, exist_ok=True)
+    # Later entries replace those of the caller's environment.
     return {
         **os.environ,
         "OPENBLAS_NUM_THREADS": "1",
@@ -58,6 +59,7 @@ def toc_pages(toc: Path = ROOT / "_toc.yml") -> list[str]:
     def walk(node: Any) -> Iterator[str]:
         if isinstance(node, dict):
             for key, value in node.items():
+                # Only these keys name pages; all others lead to lists of them.
                 if key in ("root", "file"):
                     yield str(value).removesuffix(".md").removesuffix(".ipynb")
                 else:
@@ -98,6 +100,7 @@ def chosen(names: list[str]) -> list[Path]:
         matches = [
             c for c in chapters() if c.stem == name or c.stem.startswith(f"{name}-")
         ]
+        # A file outside the table of contents may be given by its path.
         path = matches[0] if matches else Path(name).with_suffix(".md").resolve()
         if not path.is_file():
             sys.exit(
@@ -120,12 +123,14 @@ def output_texts(output: Any) -> Iterator[str]:
 
 def foreign_text(output: Any) -> str:
     """Return a piece of the output that belongs to one machine or one run, or ''."""
+    # An output with a path of this machine would differ on the next one.
     local_paths = [str(ROOT), str(Path.home()), tempfile.gettempdir(), sys.prefix]
     for text in output_texts(output):
         match = _FOREIGN.search(text)
         if match:
             return match.group()
         for path in local_paths:
+            # A home folder "/" is in every path.
             if len(path) > 1 and path in text:
                 return path
     return ""

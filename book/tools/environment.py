@@ -26,9 +26,11 @@ def is_complete(folder, repository):
     """Return whether the environment is complete, works, and belongs to this repository."""
     python = os.path.join(folder, "bin", "python")
     try:
+        # The stamp names the repository for which the environment was made.
         with open(os.path.join(folder, "stamp"), encoding="utf-8") as stamp:
             if stamp.read() != repository + "\n":
                 return False
+        # A broken link to a removed Python fails here.
         return subprocess.call([python, "-c", ""], stderr=subprocess.DEVNULL) == 0
     except OSError:
         return False
@@ -38,6 +40,7 @@ def main():
     folder = sys.argv[1]
     repository = os.getcwd()
     if sys.version_info < OLDEST:
+        # Joined by +, not an f-string: a very old Python has to parse this file too.
         version = ".".join(map(str, sys.version_info[:3])) + " (" + sys.executable + ")"
         sys.exit(
             "Python 3.11 or newer is needed, got "
@@ -56,9 +59,12 @@ def main():
     # The list is complete, so dependencies need no resolution. For `name[extra]` older versions of
     # pip would take the newest release instead of the listed one, and reject it without a hash.
     run(python, *pip, "--no-deps", "--require-hashes", "-r", "requirements.txt")
+    # The library and the kit are installed as links, so that edits count at once.
     for package in (".", "book/kit"):
         run(python, *pip, "--no-deps", "--no-build-isolation", "--editable", package)
+    # matplotlib's first import lists the fonts and may warn: here, not in a chapter.
     run(python, "-W", "ignore", "-c", "import matplotlib.font_manager")
+    # Replacing a file is one step: the stamp is there completely or not at all.
     with open(stamp + ".new", "w", encoding="utf-8") as file:
         file.write(repository + "\n")
     os.replace(stamp + ".new", stamp)

@@ -74,6 +74,7 @@ def write(
     heads = {}
     for part in parts:
         texts[part], heads[part] = driver.execute_script(PART, part)
+    # A link "#id" leads into one page of the site, but into one of many files here.
     home = {
         i: part
         for part, text in texts.items()
@@ -89,9 +90,11 @@ def write(
         return f'src="{name}"'
 
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as book:
+        # The format wants this file first, without compression.
         book.writestr("mimetype", "application/epub+zip", zipfile.ZIP_STORED)
         book.writestr("META-INF/container.xml", CONTAINER)
         for part, text in texts.items():
+            # The page's own addresses become those of the files in the archive.
             text = re.sub(r'href="#([^"]+)"', place, text)
             text = re.sub(r'src="(file:[^"]+)"', picture, text)
             title = html.escape(heads[part][0][1])
@@ -99,6 +102,7 @@ def write(
         for uri, name in pictures.items():
             content = io.BytesIO()
             with Image.open(unquote(uri.removeprefix("file://"))) as image:
+                # Older readers do not show WebP.
                 image.convert("RGB").save(content, format="png", optimize=True)
             book.writestr(f"OEBPS/{name}", content.getvalue(), zipfile.ZIP_STORED)
         book.writestr("OEBPS/style.css", STYLE + style)
@@ -111,6 +115,7 @@ def navigation(heads: dict[str, list[tuple[str, str]]]) -> str:
     lines = []
     for part, titles in heads.items():
         links = []
+        # The first link leads to the part, the others to its sections.
         for place, words in titles:
             address = f"{part}.xhtml#{place}"
             links.append(f'<a href="{address}">{html.escape(words)}</a>')
@@ -128,6 +133,7 @@ def package(texts: dict[str, str], pictures: list[str], about: dict[str, str]) -
         '<item id="style" href="style.css" media-type="text/css"/>',
     ]
     for part, text in texts.items():
+        # A reader must be told which files have formulas or drawings.
         properties = [
             word for word, tag in (("mathml", "<math"), ("svg", "<svg")) if tag in text
         ]
@@ -135,8 +141,10 @@ def package(texts: dict[str, str], pictures: list[str], about: dict[str, str]) -
         items += [f'<item id="{part}" href="{part}.xhtml" {XHTML}{attribute}/>']
     for k, name in enumerate(pictures):
         items += [f'<item id="picture-{k}" href="{name}" media-type="image/png"/>']
+    # The spine is the order of reading.
     spine = "".join(f'<itemref idref="{part}"/>' for part in ("nav", *texts))
     now = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    # The same edition gets the same identifier in every build.
     identifier = uuid.uuid5(uuid.NAMESPACE_URL, f"{about['title']} {about['version']}")
     return PACKAGE.format(
         who=identifier, now=now, items="".join(items), spine=spine, **about

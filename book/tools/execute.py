@@ -97,6 +97,7 @@ def run(notebook: Any, folder: Path) -> None:
         resources={"metadata": {"path": str(folder)}},
     )
     client.execute(env=fixed_environment())
+    # The kernel writes its version of Python there, which differs between machines.
     notebook.metadata["language_info"] = nbformat.from_dict(LANGUAGE)
     for cell in notebook.cells:
         shrink_pictures(cell.get("outputs", []))
@@ -108,6 +109,7 @@ def complaints(notebook: Any) -> list[str]:
     for cell in notebook.cells:
         for output in cell.get("outputs", []):
             where = f"cell {cell['id']}:\n{cell.source}\n"
+            # A warning is a fault of the chapter, not part of its result.
             if output.get("name") == "stderr":
                 problems.append(
                     f"{where}wrote to stderr (fix the cause):\n{output['text']}"
@@ -122,6 +124,7 @@ def complaints(notebook: Any) -> list[str]:
 
 def dump(notebook: Any) -> str:
     """Return the notebook as text: sorted keys, and widget models numbered in order of creation."""
+    # Sorted keys: dictionaries of a kernel have no order that lasts.
     text: str = (
         nbformat.writes(notebook, sort_keys=True, indent=1, ensure_ascii=False) + "\n"
     )
@@ -134,6 +137,7 @@ def dump(notebook: Any) -> str:
 
 
 def _sort_keys(text: str) -> str:
+    # Reading and writing again sorts the keys by their new names.
     notebook = nbformat.reads(text, as_version=4)
     return (
         str(nbformat.writes(notebook, sort_keys=True, indent=1, ensure_ascii=False))
@@ -165,6 +169,7 @@ def cells_of(text: str) -> list[Any]:
 
 def execute(source: Path, check: bool = False, compare_bytes: bool = False) -> str:
     """Execute one chapter; return its problems, or ''."""
+    # This process starts the kernel, which inherits its environment.
     os.environ.update(fixed_environment())
     started = time.perf_counter()
     notebook = read(source)
@@ -184,6 +189,7 @@ def execute(source: Path, check: bool = False, compare_bytes: bool = False) -> s
         if difference:
             return f"{target.name}: {difference}"
     else:
+        # Line ends are the same on every system.
         target.write_text(text, encoding="utf-8", newline="\n")
     print(f"{source.stem}: {time.perf_counter() - started:.1f} s", flush=True)
     return ""
@@ -199,6 +205,7 @@ def copy_sources(source: Path) -> str:
         return f"{target.name}: has other cells than the Markdown: make outputs"
     for new, old in zip(fresh.cells, stored.cells, strict=True):
         if new.cell_type == "code":
+            # The code may have changed by a name only; the caller knows that.
             new.outputs = old.outputs
             new.execution_count = old.execution_count
             shrink_pictures(new.outputs)
@@ -226,6 +233,7 @@ def main() -> int:
     if options.sources:
         problems = [copy_sources(source) for source in sources]
     else:
+        # A process for each chapter: kernels and their environments stay apart.
         with ProcessPoolExecutor(max_workers=options.jobs) as pool:
             n = len(sources)
             compare_bytes = [options.bytes] * n
@@ -241,6 +249,7 @@ def main() -> int:
         print(problem, file=sys.stderr)
     if not sources:
         print(f"{ROOT.name}: the table of contents has no chapter", file=sys.stderr)
+    # No chapter at all is a fault too: nothing was checked.
     return int(any(problems) or not sources)
 
 

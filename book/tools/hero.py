@@ -32,6 +32,7 @@ def pages() -> Iterator[str]:
 
 
 def main() -> int:
+    # The slider stores its frames as JSON beside its controls.
     html = next(page for page in pages() if SLIDER in page)
     data = re.search(r'<script type="application/json">(.*?)</script>', html, re.DOTALL)
     if data is None:
@@ -40,12 +41,14 @@ def main() -> int:
     frames = [
         Image.open(io.BytesIO(base64.b64decode(frame))) for frame in slider["frames"]
     ]
+    # Areas of one colour compress best: few colours, and no dithering.
     resized = [
         frame.convert("RGB")
         .resize((720, 720 * frame.height // frame.width))
         .quantize(64, dither=Image.Dither.NONE)
         for frame in frames
     ]
+    # The last frame stands still for a moment before the loop starts again.
     times = [slider["milliseconds"]] * (len(resized) - 1) + [1500]
     resized[0].save(
         TARGET, save_all=True, append_images=resized[1:], duration=times, loop=0

@@ -69,6 +69,7 @@ class Names:
 
 def labels_of(text: str) -> Iterator[str]:
     """Yield the labels of a text's equations, in order."""
+    # Both forms of equation count in one sequence, by their place in the text.
     positions = [
         (m.start(), dict(OPTION.findall(m["body"])).get("label"))
         for m in MATH.finditer(text)
@@ -102,9 +103,11 @@ def names(sources: list[Path]) -> Names:
         if (
             number is None or number != previous_number
         ):  # a chapter's second page counts on
+            # The first page of a chapter starts at 1.
             equations = figures = 0
         previous_number = number
         for text, figure in texts_of(source):
+            # A reference to a page shows its title.
             title = TITLE.search(text)
             if title:
                 chapter = title[1] if number is None else f"Chapter {page}, {title[1]}"
@@ -127,7 +130,9 @@ def cite(key: str, references: BibliographyData) -> tuple[str, str]:
     """Return the authors of an entry, as a citation names them, and its year."""
     entry = references.entries[key]
     people = entry.persons.get("author") or entry.persons.get("editor") or []
+    # "van Loan": the prelast name belongs to the surname.
     surnames = [" ".join([*p.prelast_names, *p.last_names]).strip("{}") for p in people]
+    # Two authors are named, of more only the first.
     authors = (
         f"{surnames[0]} et al." if len(surnames) > 2 else " and ".join(surnames) or key
     )
@@ -140,6 +145,7 @@ def render_role(
     """Return the text that replaces a role."""
     if role.startswith("cite"):
         entries = [cite(key.strip(), refs) for key in target.split(",")]
+        # In the text: names, and the year in parentheses. Otherwise all in parentheses.
         if role == "cite:t":
             return "; ".join(
                 f"[{who} ({year})](bibliography.md)" for who, year in entries
@@ -149,12 +155,14 @@ def render_role(
             + "; ".join(f"{who}, {year}" for who, year in entries)
             + "](bibliography.md))"
         )
+    # A role is "target" or "text <target>".
     text, _, reference = target.rpartition("<")
     label = reference.rstrip(">").strip() if text else target
     # A target may be a path of a page, or a label.
     label = label.removeprefix("/").removeprefix("book/").removesuffix(".md")
     words = text.strip() or all_names.words.get(label, label)
     home = all_names.homes.get(label, page)
+    # A label of the same page needs no link.
     return words if home == page else f"[{words}]({file_of(home)})"
 
 
@@ -177,11 +185,14 @@ def plain(text: str, page: str, all_names: Names, references: BibliographyData) 
 
     # Equations first: their numbers come from labels that are removed here.
     text = MATH.sub(equation, DOLLARS.sub(dollars, text))
+    # JupyterLab cannot fold a solution: it gets a heading.
     text = SOLUTION.sub(lambda m: "**Solution**\n" if m[2] == "start" else "", text)
     text = INCLUDE.sub(lambda m: reproductions_text(), text)
+    # Parts that the build computes are files of the built book only.
     text = MADE.sub(
         "*The page of the book has a list here that the build computes.*", text
     )
+    # Chapters are notebooks in the copy.
     text = re.sub(r"\]\((?:/book/)?(\d\d[a-z]?-[\w-]+)\.md", r"](\1.ipynb", text)
     return ROLE.sub(
         lambda m: render_role(m[1], m[2], page, all_names, references), text
@@ -201,7 +212,9 @@ def notebook(source: Path, all_names: Names, references: BibliographyData) -> An
             cell.source = plain(cell.source, source.stem, all_names, references)
             continue
         if HIDDEN & set(cell.metadata.get("tags", [])):
+            # JupyterLab's own mark for folded code; the book's tags mean nothing to it.
             cell.metadata["jupyter"] = {"source_hidden": True}
+        # The caption becomes a cell of text below the figure.
         figure = cell.metadata.get("mystnb", {}).get("figure")
         if figure:
             figures += 1
@@ -221,6 +234,7 @@ def notebook(source: Path, all_names: Names, references: BibliographyData) -> An
 
 def bibliography(references: BibliographyData) -> str:
     """Return the list of references as Markdown."""
+    # The style and the order of the book's own bibliography
     style = find_plugin("pybtex.style.formatting", "plain")()
     backend = find_plugin("pybtex.backends", "markdown")()
     entries = sorted(references.entries.values(), key=lambda e: cite(e.key, references))
@@ -239,6 +253,7 @@ def copy(folder: Path) -> list[Path]:
     notebooks = []
     book.mkdir(parents=True)
     for source in pages:
+        # Pages made by the build are replaced by a text, all others are copied.
         if is_chapter(source):
             target = book / f"{source.stem}.ipynb"
             nbformat.write(notebook(source, all_names, references), target)
@@ -253,6 +268,7 @@ def copy(folder: Path) -> list[Path]:
             )
             (book / source.name).write_text(text, encoding="utf-8")
     ignored = shutil.ignore_patterns("__pycache__", ".*")
+    # Chapters load these scripts, and the data beside the book.
     for name in ("examples", "studies"):
         shutil.copytree(BOOK / name, book / name, ignore=ignored)
     shutil.copytree(ROOT / "data", folder / "data", ignore=ignored)
@@ -264,6 +280,7 @@ def settings(folder: Path) -> dict[str, str]:
     home = folder / ".jupyter"
     viewers = home / "lab" / "user-settings" / "@jupyterlab" / "docmanager-extension"
     viewers.mkdir(parents=True, exist_ok=True)
+    # Pages of text open as text, not as source.
     chosen = {"defaultViewers": {"markdown": "Markdown Preview"}}
     (viewers / "plugin.jupyterlab-settings").write_text(
         json.dumps(chosen), encoding="utf-8"
@@ -282,6 +299,7 @@ def trust(notebooks: list[Path], environment: dict[str, str]) -> None:
     """Sign the notebooks, so that their sliders work before a cell is run."""
     data = Path(environment["JUPYTER_DATA_DIR"])
     data.mkdir(parents=True, exist_ok=True)
+    # JupyterLab sanitises the HTML of an unsigned notebook: sliders would not move.
     notary = NotebookNotary(data_dir=str(data))
     for path in notebooks:
         notary.sign(nbformat.read(path, as_version=4))
@@ -298,6 +316,7 @@ def main(arguments: list[str] | None = None) -> int:
     # The copy must not replace the repository, or lie within the book.
     if folder in (ROOT, *ROOT.parents) or folder.is_relative_to(BOOK):
         parser.error(f"{options.folder}: would be written over the repository")
+    # A folder with a book is an existing copy, and stays as it is.
     environment = settings(folder) if (folder / "book").is_dir() else {}
     if environment:
         print(

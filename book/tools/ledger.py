@@ -54,6 +54,7 @@ WORDS = {
 def verdicts_of(notebook: Path) -> list[dict[str, str]]:
     """Return the verdicts that one stored notebook displays, each with its chapter."""
     stored: Any = nbformat.read(notebook, as_version=4)
+    # A chapter displays a verdict in several forms; this one is for machines.
     verdicts = [
         output["data"][VERDICT]
         for cell in stored.cells
@@ -115,6 +116,7 @@ def summaries(rows: list[dict[str, str]]) -> dict[str, tuple[int, dict[str, int]
     for kind, verdicts in VERDICTS.items():
         counts = Counter(row["verdict"] for row in rows if row["kind"] == kind)
         by_verdict = {verdict: counts[verdict] for verdict in verdicts}
+        # All possible verdicts are listed, also those that no item has.
         summary[kind] = (counts.total(), by_verdict)
     return summary
 
@@ -152,6 +154,7 @@ def claims_of(row: dict[str, str]) -> list[LedgerClaim]:
     # Each cell of the row lists the claims by their ids, in its own form.
     ours = split_claims(row["ours"], r"(?P<id>[a-z0-9-]+) (?P<word>holds|fails): ")
     ids = "|".join(dict.fromkeys(match["id"] for _, match, _ in ours))
+    # Nulls and ranges are matched to the claims by start and id.
     nulls = {}
     for start, match, text in split_claims(row["null"], rf"(?P<id>{ids}), "):
         nulls[start, match["id"]] = text

@@ -31,13 +31,16 @@ def lighten(folder: Path) -> None:
     """Make the pages of a built book smaller, without a change of any pixel."""
     images = folder / "_images"
     with ThreadPoolExecutor() as pool:
+        # One thread a picture: Pillow releases the interpreter's lock while it encodes.
         converted = [
             name for name in pool.map(as_webp, sorted(images.glob("*.png"))) if name
         ]
+    # Only pictures that became smaller have a new name.
     references = re.compile(rf"(_images/)({'|'.join(map(re.escape, converted))})\.png")
     for page in sorted(folder.rglob("*.html")):
         before = page.read_text(encoding="utf-8")
         text = references.sub(r"\1\2.webp", before) if converted else before
+        # Links of a page are relative, so that the book can be moved.
         relative = os.path.relpath(images, page.parent)
         text = FRAMES.sub(
             lambda found, relative=relative: outside(found, images, relative), text
@@ -69,10 +72,12 @@ def outside(found: re.Match[str], images: Path, where: str) -> str:
         # Named by content: equal frames share a file.
         names += [f"{hashlib.sha256(content).hexdigest()[:24]}.webp"]
         (images / names[-1]).write_bytes(content)
+    # The first frame is also an <img>, which gets the same file.
     links = dict(
         zip((f"{INLINE}{frame}" for frame in data["frames"]), names, strict=True)
     )
     data["frames"] = [f"{where}/{name}" for name in names]
+    # "</" would end the script element that holds the data.
     text_of_data = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
     text = found[0].replace(found["data"], text_of_data).replace(f'"{INLINE}" + ', "")
     text = re.sub(

@@ -115,6 +115,7 @@ PARTS = {
 }
 ORDINAL = ("third", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth", "twelfth")
 COUNT = "|".join((*ONES, *TENS, *LARGE))
+# "three quarters", "half a million", "two hundred and five", "half"
 WORDS = re.compile(
     rf"\b(?:(?:an?|{COUNT})(?:[ -](?:{COUNT}))*[ -](?:of an? )?(?:{'|'.join(PARTS)})s?\b"
     rf"|half an?(?= (?:million|thousand|hundred))(?: (?:{'|'.join(LARGE)}))"
@@ -123,6 +124,7 @@ WORDS = re.compile(
     rf"|(?:half|halves|twice|quarter|third)\b)",
     re.I,
 )
+# "12", "-1.5e-3", "10 000" with a blank, ".5"; not the digits of a name such as x1
 DIGITS = re.compile(
     r"(?<![\w.])[-−]?(?:\d{1,3}(?:[ \u00a0\u2009]\d{3})+|\d+)(?:\.\d+)?(?:e[-+]?\d+)?"
     r"(?!\w*[a-zA-Z]\d)"
@@ -356,6 +358,7 @@ FORMULA = re.compile(r"\$([^$]+)\$")
 
 def evaluate(text: str) -> float | None:
     """Return the value of a formula of numbers only, or None."""
+    # TeX becomes Python: \frac12, \frac{1}{2}, \sqrt{2}, |x|, e^x, \cdot, 2\pi.
     text = re.sub(r"\\[td]?frac(\d)(\d)", r"(\1/\2)", text)
     text = re.sub(r"\\[td]?frac\{([^{}]*)\}\{([^{}]*)\}", r"((\1)/(\2))", text)
     text = re.sub(r"\\(sqrt|log)\s*\{?(\d+)\}?", r"\1(\2)", text)
@@ -371,6 +374,7 @@ def evaluate(text: str) -> float | None:
     )
     text = re.sub(r"\\[,; ]|[\s{}]", "", text)
     text = re.sub(r"(?<=[\d)])(?=[a-z(])", "*", text)
+    # With any other name it is a definition, not arithmetic.
     if not re.fullmatch(r"(?:sqrt|log|abs|pi|[-+*/().\d])+", text) or not re.search(
         r"[-+*/a-z]", text
     ):
@@ -403,6 +407,8 @@ def of_formula(match: re.Match[str]) -> str:
         return f" {float(power[1] or 1) * 10.0 ** int(power[2]):g} "
     if re.fullmatch(r"\\?(?:pm)?[-\d. %]+", formula):
         return f" {formula.removeprefix(chr(92) + 'pm')} "
+    # "x = 3.5": the number at the end is a statement, but 0 and 1 are mostly
+    # definitions.
     last = re.search(
         r"(?:=|\\approx|<|>|\\leq?|\\geq?|\\pm) ?(-?\d+(?:\.\d+)?)(?:\\?[ ,;]*)$",
         formula,
@@ -412,17 +418,20 @@ def of_formula(match: re.Match[str]) -> str:
 
 def plain(text: str) -> str:
     """Return prose without code, roles, addresses, comments and definitions, with its lines."""
+    # A part that is removed leaves its line breaks, so that line numbers stay right.
     keep = lambda m: "\n" * m[0].count("\n")  # noqa: E731
     text = re.sub(
         r"^(`{3,})\{(?:math|include|eval-rst)\}.*?^\1$", keep, text, flags=re.M | re.S
     )
     text = re.sub(r"^(`{3,}|:{3,}).*$|^:\w+:.*$|^%.*$|^\(.*\)=$", "", text, flags=re.M)
     text = re.sub(r"\$\$.*?\$\$", keep, text, flags=re.S)
+    # A mark stands for a citation, which `trace` accepts as a source.
     text = re.sub(r"\{cite:\w\}`[^`]*`", " ⸢cited⸣ ", text)
     text = re.sub(r"\{[\w:]+\}`[^`]*`", " ", text)
     text = re.sub(r"`([^`]*)`", lambda m: " " + re.sub(r"[^A-Za-z_]+", " ", m[1]), text)
     text = re.sub(r"\]\([^)]*\)", "]", text)
     text = FORMULA.sub(lambda m: of_formula(m) + "\n" * m[0].count("\n"), text)
+    # The number of a table's row, and of a list's item
     text = re.sub(r"^\| *\d+ *\|", "|", text, flags=re.M)
     text = re.sub(r"^( *)\d+\. ", r"\1", text, flags=re.M)
     return text
@@ -436,6 +445,7 @@ def structure(sentence: str) -> str:
     text = re.sub(
         rf"\b(?:{LABELS})\s+(?:{number_list}|{roman})", blank, sentence, flags=re.I
     )
+    # References such as (12), names such as x1 or 2-D, "12, 2003)" of a citation
     text = re.sub(r"\((?!\d+\) =)\d{1,2}[a-z]?\)(?:-\(\d+\))?", blank, text)
     text = re.sub(r"\b[A-Za-z]+\d[\w.]*|\b\d+-D\b|\b\d+[a-zA-Z]\w*-", blank, text)
     text = re.sub(r"\b\d+, (?:19|20)\d\d\)", blank, text)
@@ -451,6 +461,7 @@ def numerals_of(piece: str, chapter: str, line: int, section: int) -> Iterator[N
     for block in re.finditer(r"(?:[^\n]+\n?)+", plain(piece)):
         start = line + piece_line(plain(piece), block.start())
         text = block[0]
+        # A sentence ends at a full stop and a blank, but not after "Fig." or "Eq.".
         for match in re.finditer(
             r"(?s).+?(?:(?<!Fig)(?<!Figs)(?<!Eq)(?<!Prop)(?<!cf)[.!?:](?=\s)|\|\n|$)",
             text,
@@ -460,6 +471,8 @@ def numerals_of(piece: str, chapter: str, line: int, section: int) -> Iterator[N
             spans: list[tuple[int, int]] = []
             for shape in (DIGITS, WORDS):
                 for hit in shape.finditer(clean):
+                    # "2 hundred" is matched by digits and by words: the first match
+                    # counts.
                     if any(a < hit.end() and hit.start() < b for a, b in spans):
                         continue
                     spans.append(hit.span())
@@ -482,9 +495,11 @@ def one(
 ) -> Iterator[Numeral]:
     """Yield the numeral of one match, with its unit and whether it is a small one."""
     text = hit[0].strip()
+    # The unit follows the number, after a blank or a hyphen.
     after = clean[hit.end() :].lstrip(" -)")
     value = number(text)
     unit = next((u for u in UNITS if re.match(u, after)), "")
+    # "A third filter" and "a second one" count things, they measure nothing.
     if text.lower() in ("third", "quarter", "a second") and not unit:
         return
     is_integer = value == int(value)
@@ -538,6 +553,7 @@ ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
 
 def constant(node: ast.AST) -> float | None:
     """Return the value of an expression of constants, or None."""
+    # `type` instead of isinstance, since True is an int.
     if isinstance(node, ast.Constant) and type(node.value) in (int, float):
         return float(node.value)
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
@@ -564,10 +580,12 @@ def numbers_compared_with(node: ast.AST) -> Iterator[float]:
         for item in (*node.keys, *node.values):
             if item is not None:
                 yield from numbers_compared_with(item)
+    # 0.5 * x: the factor 0.5 is compared with.
     elif isinstance(node, ast.BinOp):
         yield from numbers_compared_with(node.left)
         yield from numbers_compared_with(node.right)
     elif isinstance(node, ast.Call) and node.args:
+        # abs(x - 3) and log(2) compare with 3 and 2.
         name = getattr(node.func, "attr", getattr(node.func, "id", ""))
         if name in ("abs", "array", "log", "sqrt", "log10", "deg2rad"):
             yield from numbers_compared_with(node.args[0])
@@ -654,6 +672,7 @@ class CodeNumbers:
 
     def fact(self, node: Any, value: float, names: tuple[str, ...]) -> Fact:
         """Return one number with the words of its names and of the comment beside it."""
+        # The nearest names say most; those further out name whole functions.
         words = stems(" ".join((*names[-3:], self.comments.get(node.lineno, ""))))
         where = f"{self.where}: {'.'.join(names[-2:])}"
         return Fact(self.kind, value, value, where, self.section, words)
@@ -673,6 +692,7 @@ class CodeNumbers:
 
     def visit_dict(self, node: ast.Dict, names: tuple[str, ...]) -> Iterator[Fact]:
         for key, item in zip(node.keys, node.values, strict=True):
+            # A text as a key is a name of its value; any other key may hold numbers.
             label = str(key.value) if isinstance(key, ast.Constant) else ""
             if key is not None and not label:
                 yield from self.visit(key, names)
@@ -690,6 +710,7 @@ class CodeNumbers:
         for argument, default in pairs:
             if default is not None:
                 yield from self.visit(default, (*names, node.name, argument.arg))
+        # Inside a function its own name counts, not those around its definition.
         yield from self.visit_all(node.body, (node.name,))
 
     def visit_loop(self, node: ast.For, names: tuple[str, ...]) -> Iterator[Fact]:
@@ -720,6 +741,7 @@ def rows_of(page: str) -> Iterator[tuple[str, str]]:
     page = re.sub(r"<style.*?</style>", "", page, flags=re.S)
     for block in re.split(r"(?=<table)", page):
         rows = re.split(r"(?=<tr)", block)
+        # A number of a table is named by the caption and the head of its column.
         head = bare(
             " ".join(
                 re.findall(r"<caption.*?</caption>|<thead.*?</thead>", block, re.S)
@@ -780,10 +802,12 @@ def entry_facts(
     words = stems(f"{name} {title}")
     where = f"{file}: {name}"
     for value in flat(entry["value"]):
+        # A value that the paper gives counts as published and as a parameter.
         for k in {kind, "parameter"}:
             unit = str(entry["unit"])
             yield Fact(k, value, value, where, words=words, unit=unit)
     for match in NUMBER.finditer(reason):
+        # One digit in a reason would match too many sentences.
         if digits(match[0]) > 1:
             value = number(match[0])
             words_of_reason = stems(f"{name} {reason}")
@@ -823,6 +847,7 @@ def study_facts(name: str) -> tuple[Fact, ...]:
         return ()
     code = path.read_text(encoding="utf-8")
     facts = list(parameters(code, path.name))
+    # A study that imports another script uses its numbers too.
     for other in re.findall(
         r"^(?:import|from) (\w+)|script\(\"([\w-]+)\"\)", code, re.M
     ):
@@ -834,6 +859,7 @@ def study_facts(name: str) -> tuple[Fact, ...]:
         rows = [
             r for r in stored.read_text(encoding="utf-8").splitlines() if r[:1] != "#"
         ]
+        # The number of stored trials is the size of the study.
         facts.append(
             Fact(
                 "parameter",
@@ -857,6 +883,7 @@ def defaults() -> dict[str, tuple[Fact, ...]]:
     for path in sorted(files):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.FunctionDef):
+                # Only the head of a function, with an empty body: its defaults.
                 signature = ast.FunctionDef(node.name, node.args, [ast.Pass()], [])
                 code = ast.unparse(ast.fix_missing_locations(signature))
                 facts[node.name] = (
@@ -904,6 +931,7 @@ def factors(unit: str) -> tuple[float, ...]:
 
 def nearby(facts: list[Fact]) -> Callable[[Numeral], list[Fact]]:
     """Return a function that preselects the facts that a numeral may refer to, for `trace`."""
+    # Arrays of all facts, since `trace` is called for thousands of replacements.
     low, high = np.array([(f.low, f.high) for f in facts], dtype=float).reshape(-1, 2).T
 
     def find(n: Numeral) -> list[Fact]:
@@ -911,6 +939,8 @@ def nearby(facts: list[Fact]) -> Callable[[Numeral], list[Fact]]:
         values = n.value * scale
         half = 0.501 * n.step * scale
         with np.errstate(divide="ignore"):
+            # A numeral may be written as x, 1/x ("a fifth" for 5), 1 + x or 1 - x
+            # (percents).
             targets = np.concatenate([values, 1 / values, 1 + values, 1 - values])[
                 :, None
             ]
@@ -948,6 +978,7 @@ def matches_check(n: Numeral, f: Fact, factor: float) -> bool:
         equal = f.low == value and f.unit == (n.unit or "no unit")
         return factor == 1 and equal and (nearby_section or shared)
     as_written = n.value >= 1 or re.search(r"\d", n.text)
+    # "a fifth" in words may be the number 5 of an assertion.
     targets = [value] if as_written else [value, 1 / value]
     if n.unit.startswith("%") and factor < 1:
         targets += [1 + value, 1 - value]
@@ -963,6 +994,7 @@ def matches_check(n: Numeral, f: Fact, factor: float) -> bool:
 def matches_output(n: Numeral, f: Fact, factor: float) -> bool:
     """Return whether an output prints the numeral to the digits given."""
     half = 0.5001 * n.step * factor
+    # The output must be as precise as the sentence, or more.
     if abs(abs(n.value * factor) - abs(f.low)) > half or f.half > half:
         return False
     shared = bool(n.words & f.words)
@@ -986,6 +1018,7 @@ def matches_parameter(n: Numeral, f: Fact, factor: float) -> bool:
     if abs(abs(value) - abs(f.low)) > slack(value):
         return False
     two_units = f.unit and n.unit
+    # With two units they must agree; a shared word is not enough.
     if two_units and re.search(rf"(?:^|[ ,])(?:{n.unit})", f.unit):
         return True
     if n.words & f.words and not two_units:
@@ -1009,6 +1042,7 @@ def trace(n: Numeral, facts: list[Fact]) -> str:
             matches = MATCHERS[f.kind]
             if any(matches(n, f, factor) for factor in factors(n.unit)):
                 best[f.kind] = f.where
+    # The strongest kind of trace is named.
     for kind in ("check", "parameter", "output", "published"):
         if kind in best:
             return f"{kind}: {best[kind]}"
@@ -1042,6 +1076,7 @@ def others(n: Numeral) -> Iterator[Numeral]:
             if re.search(r"\d", n.text)
             else 10.0 ** (len(str(int(n.value)).rstrip("0")) < n_digits)
         )
+        # Numbers with as many digits, spread by a multiple of a prime: no random draw.
         low = 10 ** (n_digits - 1)
         high = 10**n_digits
         for k in range(16):
@@ -1061,6 +1096,7 @@ def prose_numerals(
     """Return the numerals of a piece of prose, and the number of the section it ends in."""
     numerals: list[Numeral] = []
     for part in re.split(r"^(?=#+ )", piece, flags=re.M):
+        # Every heading starts a section, to which cells after it belong.
         section += part.startswith("#")
         numerals += numerals_of(part, chapter, line, section)
         line += part.count("\n")
@@ -1092,6 +1128,7 @@ def facts_of_sources(source: Path, code: str) -> list[Fact]:
         facts += study_facts(name)
     for name in sorted(set(re.findall(r"\b([a-z]\w+)\(", code))):
         facts += defaults().get(name, ())
+    # The first page shows results of chapter 4, so it may use its numbers.
     if source.stem == "index":
         for other in chosen(["04", "04b"]):
             facts += [replace(f, section=-1) for f in read(other)[1]]
@@ -1117,6 +1154,7 @@ def read(source: Path) -> tuple[list[Numeral], list[Fact]]:
             more, section = prose_numerals(piece, chapter, line, section)
             numerals += more
             continue
+        # Cells of the Markdown and of the notebook are in the same order.
         where = f"cell {len(codes) + 1}"
         for text in alternative_texts(piece):
             numerals += numerals_of(text, chapter, line, section)

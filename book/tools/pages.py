@@ -45,6 +45,7 @@ BLOCK = re.compile(r'<div class="highlight-ipython3[^>]*>.*?</pre>', re.S)
 
 def chapter_label(page: str) -> str | None:
     """Return the label of a chapter's page: "1", and "1b" for a second page."""
+    # The file name has a leading zero, the label has none.
     match = re.match(r"book/0*(\d+[a-z]?)-", page)
     return match.group(1) if match else None
 
@@ -64,6 +65,8 @@ def chapter_pages() -> dict[str, str]:
 def drop_widgets(tree: nodes.document) -> None:
     """Remove the text form of widgets, a line with the names of their parts."""
     for node in list(tree.findall(nodes.literal_block)):
+        # A widget prints as `interactive(children=(...))`, which tells a reader
+        # nothing.
         if node.astext().startswith("interactive(children="):
             node.parent.remove(node)
 
@@ -106,6 +109,7 @@ def number_chapters(env: Any, number_of: Any) -> None:
         # Sections have no number of their own.
         sections = dict.fromkeys([entry["anchorname"] for entry in entries])
         env.toc_secnumbers[page] = {**sections, "": (number,)}
+        # The title on the page, and its first entry in the list of contents
         for node in (title, entries[0]):
             node["secnumber"] = [number]
 
@@ -113,6 +117,7 @@ def number_chapters(env: Any, number_of: Any) -> None:
 def modules() -> list[str]:
     """Return every module of the library, the package first."""
     root = ROOT / "distfilt"
+    # Modules that begin with an underscore are private.
     public = (p for p in root.rglob("*.py") if p.stem == "__init__" or p.stem[0] != "_")
     paths = sorted(public)
     names = [
@@ -125,15 +130,18 @@ def directive(module: Any, name: str) -> list[str]:
     """Return the lines that document one public name of the module that defines it."""
     value = getattr(module, name)
     if inspect.isclass(value) and value.__module__.startswith("distfilt"):
+        # Sphinx documents classes and functions; other values need a line of their own.
         return [f".. autoclass:: {module.__name__}.{name}", "   :members:", ""]
     if inspect.isfunction(value):
         return [f".. autofunction:: {module.__name__}.{name}", ""]
+    # The text below an assignment, which Sphinx takes for the variable's docstring
     meaning = (
         ModuleAnalyzer.for_module(module.__name__).find_attr_docs().get(("", name), [])
     )
     if inspect.isclass(value):
         meaning = [f"Short for ``{value.__module__}.{value.__qualname__}``."]
     elif get_origin(value) is not None:
+        # Annotated[base, note, ...] has conditions such as a lower bound as notes.
         base, *notes = get_args(value) if get_origin(value) is Annotated else (value,)
         kind = (
             "np.ndarray"
@@ -150,6 +158,7 @@ def directive(module: Any, name: str) -> list[str]:
 
 def word_of(note: Any) -> str:
     """Return a note of a type in words: ``at_least(1)`` for a condition with its bound."""
+    # A condition with its bound is a partial: at_least(1).
     if isinstance(note, functools.partial):
         return f"{word_of(note.func)}({', '.join(map(str, note.args))})"
     return str(getattr(note, "__name__", note)).lstrip("_")
@@ -165,6 +174,7 @@ def home_of(module: Any, name: str) -> str:
     if knows_home:
         return home
     # A constant has no module of its own: find the module below that exports the same object.
+    # Equal constants are told apart by identity: the module exports this very object.
     below = [n for n in modules() if n.startswith(f"{module.__name__}.")]
     same_value = (
         n for n in below if vars(importlib.import_module(n)).get(name) is value
@@ -186,6 +196,7 @@ def type_names() -> list[tuple[Any, str]]:
 
 def format_type(kind: Any, names: Mapping[str, Any]) -> str:
     """Return a type as a reader would write it: ``Array['... N d']``, ``PositiveInt | None``."""
+    # An annotation inside another one may be a text that is not evaluated yet.
     if isinstance(kind, ForwardRef):
         kind = kind.__forward_arg__
     if isinstance(kind, str):
@@ -199,6 +210,7 @@ def format_type(kind: Any, names: Mapping[str, Any]) -> str:
         return "None"
     if isinstance(kind, list):  # the arguments of a Callable
         return f"[{format_types(kind, names, ', ')}]"
+    # An alias such as PositiveInt is shown by its name, not by its parts.
     for value, name in type_names():
         if value == kind:
             return name
@@ -218,6 +230,8 @@ def format_generic(kind: Any, names: Mapping[str, Any]) -> str:
     arguments = get_args(kind)
     if origin is Annotated:
         notes = [note for note in arguments[1:] if isinstance(note, str)]
+        # Among the notes of an array, a text is its shape, or the mark that it may hold
+        # NaN.
         shapes = [note for note in notes if note != ALLOW_NAN]
         shape = f"[{shapes[-1]!r}]" if shapes else ""
         return format_type(arguments[0], names) + shape
@@ -233,6 +247,7 @@ def format_generic(kind: Any, names: Mapping[str, Any]) -> str:
 
 def default(value: Any) -> str:
     """Return a default value as code: a function's name, dots if there is no short form."""
+    # `<object at 0x...>` is no code and differs in each build.
     text = getattr(value, "__name__", None) or repr(value)
     try:
         ast.parse(text)
@@ -246,6 +261,7 @@ def signature(kind: str, value: Any) -> tuple[str, str | None] | None:
     if kind not in ("function", "method", "class"):
         return None
     try:
+        # Built-in classes may have no signature.
         signature_ = inspect.signature(value)
     except (TypeError, ValueError):
         return None
@@ -257,8 +273,10 @@ def signature(kind: str, value: Any) -> tuple[str, str | None] | None:
     kinds = inspect.Parameter
     last = None
     for k, part in enumerate(signature_.parameters.values()):
+        # A caller does not write `self`.
         if k == 0 and part.name == "self":
             continue
+        # A bare star stands before the first keyword-only argument, unless *args does.
         if part.kind is kinds.KEYWORD_ONLY and last not in (
             part.kind,
             kinds.VAR_POSITIONAL,
@@ -284,6 +302,7 @@ def escape_stars(lines: list[str]) -> None:
     """Escape the star of a shape such as ``(*runs, N, d)``, which is no emphasis."""
     for k, line in enumerate(lines):
         if not line.lstrip().startswith((">>>", "...")):
+            # Every second part is literal text, where a star is no emphasis.
             parts = line.split("``")
             parts[::2] = [
                 re.sub(r"(?<=[(\s])\*(?=\w+[,)])", r"\\*", part) for part in parts[::2]
@@ -315,6 +334,7 @@ def api_parts() -> dict[str, list[str]]:
     parts: dict[str, list[str]] = {}
     for name in modules():
         if name != "distfilt":
+            # The part is the subpackage: distfilt.PART.module
             parts.setdefault(name.split(".")[1], []).append(name)
     order = [
         *(p for p in FIRST if p in parts),
@@ -331,6 +351,7 @@ def anchor(name: str) -> str:
 def homes() -> dict[str, str]:
     """Return the entry of each public name, by every path from which it can be imported."""
     entries = {}
+    # A package's exports have one entry, in the module that defines them.
     for path in modules():
         module = importlib.import_module(path)
         for name in module.__all__:
@@ -353,6 +374,7 @@ def code_of(source: Path) -> str:
 def imports_of(code: str, entry_of: dict[str, str]) -> dict[str, str]:
     """Return the names under which code imports parts of the library, each with its entry."""
     entries = {}
+    # Only names that are imported one by one are linked.
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
             "distfilt"
@@ -370,6 +392,7 @@ def names_used(code: str, entry_of: dict[str, str]) -> set[str]:
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Name) and node.id in names:
             used.add(names[node.id])
+        # `filters.EnsembleFilter`, where `filters` was imported
         elif isinstance(node, ast.Attribute):
             owner = getattr(node.value, "id", "")
             if owner not in names:
@@ -383,6 +406,7 @@ def users() -> dict[str, list[str]]:
     """Return, for each name of the library, links to the chapters and scripts that use it."""
     entry_of = homes()
     links = {}
+    # Chapters first, since a page is a better example than a script.
     scripts = [*(BOOK / "examples").glob("*.py"), *(BOOK / "studies").glob("*.py")]
     for source in [*chapters(), *sorted(scripts)]:
         if source.suffix == ".md":
@@ -429,6 +453,7 @@ def link_code(
         r'(?:<span class="o">\.</span><span class="n">(?P<part>\w+)</span>)?'
         r'(?!<span class="o">=</span>)'
     )
+    # Only inside the code of cells: prose may have the same words.
     return BLOCK.sub(lambda block: name.sub(link, block[0]), body)
 
 
@@ -490,6 +515,7 @@ def api_part(part: str, by: dict[str, list[str]]) -> str:
         title = f"# `{head}`" if name == head else f"## `{name[len(head) + 1 :]}`"
         lines += [f"({anchor(name)})=", title, ""]
         body = [f".. automodule:: {name}", "   :no-members:", ""]
+        # A protocol may be exported too; each name is documented once.
         for public in dict.fromkeys(documented):
             body += [*directive(module, public)[:-1], *used_in(f"{name}.{public}", by)]
         lines += ["```{eval-rst}", *body, "```", ""]
@@ -523,6 +549,7 @@ def reproductions_text() -> str:
         lines += [f"## {PAPERS.get(paper, paper)} (`{paper}`)", ""]
         lines += ["| Item | Shows | Chapter | Verdict |", "|---|---|---|---|"]
         for row in rows_of_paper:
+            # A no-break space keeps "Fig. 1" in one line of a narrow column.
             cells = [
                 row["item"].replace(" ", "\u00a0"),
                 cell(titles[paper, row["item"]]),
@@ -530,6 +557,7 @@ def reproductions_text() -> str:
             cells += [chapter_link(row["chapter"]), row["verdict"]]
             lines += ["| " + " | ".join(cells) + " |"]
         lines += [""]
+        # A table of parameters that was read as printed needs no evidence.
         for row in (row for row in rows_of_paper if row["verdict"] != "read"):
             lines += claims_text(row, titles[paper, row["item"]])
     return "\n".join(lines)
@@ -550,9 +578,11 @@ def claims_text(row: dict[str, str], title: str) -> list[str]:
         ]
     folder = ROOT / "data" / "published" / row["paper"]
     name = row["item"].lower()
+    # "Fig. 1" has its claims in figure-1.csv, "Table 2" in table-2-claims.csv.
     stem = name.replace("fig. ", "figure-").replace("table ", "table-")
     path = folder / f"{stem}{'' if stem.startswith('figure') else '-claims'}.csv"
     listed = {claim["id"]: claim for claim in read_rows(path)}
+    # Claims of two starts share a rule, which is shown once.
     for k in dict.fromkeys(claim.id for claim in claims):
         lines += [f"{listed[k]['claim']}", f": *Rule:* {listed[k]['criterion']}"]
         for claim in (c for c in claims if c.id == k):
@@ -574,15 +604,18 @@ def needs() -> dict[int, set[int]]:
         text = " ".join((ROOT / f"{page}.md").read_text(encoding="utf-8").split())
         # Links become their texts, so that "chapters 1, 2 and 3" can be read.
         text = re.sub(r"\[([^]]*)\]\(\d[^)]*\)", r"\1", text)
+        # The sentence ends at a full stop before a capital letter, not at "Fig. 1".
         sentence = re.search(r"You should know .*?\.(?= [A-Z`:|#]|$)", text)
         number = chapter_number(page) or 0
         chapters = needed.setdefault(number, set())
         lists = r"[Cc]hapters? ((?:\d+(?:, and |, | and | to )?)+)"
         for part in re.findall(lists, sentence[0] if sentence else ""):
+            # "chapters 1 to 4" is a range, "1, 2 and 4" a list.
             listed = [int(n) for n in re.findall(r"\d+", part)]
             chapters |= set(
                 range(listed[0], listed[-1] + 1) if " to " in part else listed
             )
+        # A second page builds on its own chapter's first page, which is no arrow.
         chapters -= {number}
     return needed
 
@@ -608,14 +641,17 @@ def map_places(
     """
     rows: dict[int, int] = {}
     for n in needed:
+        # Chapters come in order, so that those needed have their rows already.
         rows[n] = 1 + max((rows[k] for k in needed[n]), default=-1)
     places = {}
     top = 40
     for row in range(max(rows.values()) + 1):
         in_row = [k for k in rows if rows[k] == row]
         for position, n in enumerate(in_row):
+            # Places of a row are symmetric about the middle of the map.
             offset = position - (len(in_row) - 1) / 2
             places[n] = (MAP_WIDTH / 2 + BOX_STEP * offset, top)
+        # A row is as high as its chapter with the most pages.
         top += ROW_GAP + BOX[1] * max(len(stacks[n]) for n in in_row)
     return places, top - 65
 
@@ -628,10 +664,13 @@ def map_arrows(
     """Return an arrow from each chapter to those that build on it, implied ones left out."""
     lines = []
     for n, (x, y) in places.items():
+        # If 3 needs 2 and 2 needs 1, the arrow from 1 to 3 says nothing more.
         implied = {i for j in needed[n] for i in all_needed(j, needed)}
         for k in needed[n] - implied:
             a, b = places[k]
+            # The arrow starts below the chapter's last page.
             b += BOX[1] * (len(stacks[k]) - 1)
+            # A cubic Bézier curve that leaves and enters vertically
             curve = f"M{a:g},{b + 26} C{a:g},{b + 66} {x:g},{y - 66} {x:g},{y - 27}"
             lines.append(f'<path d="{curve}"/>')
     return lines
@@ -649,6 +688,7 @@ def map_boxes(
         for k, label in enumerate(stacks[n]):
             title = chapter_title(pages[label])
             link = pages[label].removeprefix("book/")
+            # Pages of a chapter are stacked without a gap.
             middle = y + height * k
             box = (
                 f'<rect x="{x - width / 2:g}" y="{middle - 26}" width="{width}" '
@@ -667,6 +707,7 @@ def map_list(
     lines = []
     for n, labels in stacks.items():
         links = [f"[chapter {k}](/{pages[str(k)]}.md)" for k in sorted(needed[n])]
+        # "1, 2 and 3": the last comma becomes "and".
         enumeration = " and ".join(", ".join(links).rsplit(", ", 1))
         titles = []
         for label in labels:
@@ -709,6 +750,7 @@ def figures(source: Path) -> Iterator[tuple[str, str, str, bytes]]:
         options = cell["metadata"].get("mystnb", {})
         name = options.get("figure", {}).get("name")
         bundles = [output.get("data", {}) for output in cell.get("outputs", ())]
+        # A figure has one picture; numbered ones have a name.
         pictures = [data["image/png"] for data in bundles if "image/png" in data]
         if name and pictures:
             caption = options["figure"].get("caption", "")
@@ -734,6 +776,7 @@ def gallery_text(folder: Path) -> str:
                 small = Image.open(io.BytesIO(picture)).convert("RGB")
                 small.thumbnail((480, 480), reducing_gap=2.0)
                 small.quantize(64).save(target)
+            # The caption's first sentence, with the texts of its roles
             words = (
                 re.sub(r"\{[\w:]+\}`([^`<]*)[^`]*`", r"\1", caption)
                 .split(". ")[0]
@@ -777,6 +820,7 @@ def with_links(row: str) -> str:
         page = pages.get(match[2])
         return f"[{match[1]}{match[2]}](/{page}.md)" if page else match[0]
 
+    # In a table of errata chapters are named as "chapter 4", "chapters 4 and 5".
     for place in (
         r"(?<=chapter )()(\d+\w?)",
         r"(?<= and )()(\d+\w?)(?= \|$)",
@@ -790,6 +834,7 @@ def cite_text() -> str:
     """Return how to cite the book, from the file that says it for machines."""
     facts = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     who = " and ".join(author["name"] for author in facts["authors"])
+    # BibTeX keeps a name in braces together.
     fields = {
         "title": facts["title"],
         "author": "{" + who + "}",
@@ -812,10 +857,12 @@ def comparison_text() -> str:
     for name in read.FOUR:
         cells = [f"*{name}*: {read.together.problem(name).scenario.title}"]
         for budget in (0, 3, 32, math.inf):
+            # Among filters within the budget, only consistent ones compete.
             if not read.admissible(name, budget):
                 cells += ["no filter with a consistent covariance"]
                 continue
             best = read.best(name, budget)
+            # Errors are relative to the reference of the problem.
             error = read.ratio(best, read.results(name)["reference"]).estimate
             cell = read.together.CELLS[best.cell]
             cells += [f"{error:.2f}: {cell.family}; {cell.exchange}"]
@@ -838,5 +885,6 @@ def write_generated(folder: Path) -> None:
     for name, text in parts.items():
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
+        # Sphinx reads a page again if a file that it includes has a newer date.
         if not target.is_file() or target.read_text(encoding="utf-8") != text:
             target.write_text(text, encoding="utf-8")

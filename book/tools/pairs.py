@@ -50,6 +50,7 @@ def differences(source: Path, stored: Any) -> list[str]:
                 problems.append(
                     f"{ours['id']}: {key} differs between the Markdown and the notebook"
                 )
+    # The state of widgets is an output, so it is the notebook's own.
     if fresh.metadata != {k: v for k, v in stored.metadata.items() if k != "widgets"}:
         problems.append("the headers of the Markdown and of the notebook differ")
     return problems
@@ -60,6 +61,7 @@ def code_faults(cell: Any, count: int) -> list[str]:
     if not cell.source.strip():
         return ["an empty code cell"]
     faults = []
+    # Counts of 1, 2, 3 … show that the cells ran once, in order.
     if cell.execution_count != count:
         wrong = f"execution count {cell.execution_count}, needs {count}"
         faults.append(f"{wrong}: make outputs")
@@ -129,6 +131,7 @@ def check(source: Path) -> list[str]:
         return [f"{source.stem}: no stored notebook: make outputs"]
     stored = nbformat.read(target, as_version=4)
     problems = differences(source, stored)
+    # Text cells have neither outputs nor counts.
     code = [cell for cell in stored.cells if cell.cell_type == "code"]
     for count, cell in enumerate(code, start=1):
         problems += [f"{cell.get('id')}: {fault}" for fault in code_faults(cell, count)]
@@ -138,6 +141,7 @@ def check(source: Path) -> list[str]:
 def strays() -> list[str]:
     """Return pages without a file, files without a page, and code outside notebooks."""
     problems = [f"_toc.yml names {page}, which has no file" for page in missing_pages()]
+    # A file that the table of contents does not name is not built.
     pages = set(toc_pages())
     for path in sorted([*BOOK.glob("*.md"), *BOOK.glob("*.ipynb")]):
         page = path.relative_to(ROOT).with_suffix("").as_posix()

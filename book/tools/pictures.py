@@ -41,6 +41,7 @@ def extract_pictures(text: str) -> tuple[str, list[str]]:
 def pictures_of(output: Any) -> list[str]:
     """Return the pictures of an output, those that its HTML embeds included, as base64."""
     data = output.get("data", {})
+    # A slider has pictures in its HTML beside the one for print.
     pictures = [data["image/png"]] if "image/png" in data else []
     return pictures + extract_pictures(_join(data.get("text/html", "")))[1]
 
@@ -68,10 +69,12 @@ def shrink_picture(picture: str) -> str:
     A picture of finer shades, or one that has a palette already, is returned unchanged.
     """
     image = Image.open(io.BytesIO(base64.b64decode(picture)))
+    # A picture with a palette or transparent pixels stays as it is.
     if image.mode == "P" or (image.mode == "RGBA" and image.getextrema()[3][0] < 255):
         return picture
     # Without dithering, so that areas of one colour stay one colour.
     palette = image.convert("RGB").quantize(256, kmeans=1, dither=Image.Dither.NONE)
+    # A colour map has more shades than a palette, and is kept.
     if _share_of_differences(image, palette, TINT) > TINTED:
         return picture
     file = io.BytesIO()
@@ -90,6 +93,7 @@ def _share_of_differences(one: Image.Image, other: Image.Image, by: float) -> fl
     """Return the fraction of pixels with a colour that differs by more than `by` of 255."""
     # The largest difference of the three colours, for each pixel
     bands = ImageChops.difference(one.convert("RGB"), other.convert("RGB")).split()
+    # histogram()[k] counts the pixels that differ by k of 255.
     counts = reduce(ImageChops.lighter, bands).histogram()
     return sum(counts[int(by) + 1 :]) / sum(counts)
 
@@ -99,6 +103,7 @@ def difference(one: str, other: str) -> str:
     if one.strip() == other.strip():
         return ""
     try:
+        # base64 of anything but a picture raises here.
         a, b = (Image.open(io.BytesIO(base64.b64decode(p))) for p in (one, other))
         share = _share_of_differences(a, b, 255 * SHADE) if a.size == b.size else 1.0
     except (OSError, ValueError, binascii.Error):
@@ -113,6 +118,7 @@ def differences(stored: list[Any], fresh: list[Any]) -> list[str]:
     """Return how the pictures of two lists of outputs differ."""
     stored_pictures = [p for output in stored for p in pictures_of(output)]
     fresh_pictures = [p for output in fresh for p in pictures_of(output)]
+    # Without equal numbers, pairs would be compared at random.
     if len(stored_pictures) != len(fresh_pictures):
         return [f"{len(stored_pictures)} pictures stored, {len(fresh_pictures)} drawn"]
     texts = (

@@ -47,11 +47,13 @@ SETTINGS = {
 def compare(notebook: Path, extra: dict[str, str]) -> int:
     """Run one notebook against its stored outputs; return pytest's exit code."""
     started = time.perf_counter()
+    # -m "" runs tests of every mark, also those that the settings leave out.
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", ""]
     command += [
         "-p",
         "book.tools.startup",
         "-p",
+        # The first plugin makes nbformat's import fast.
         "nbval.plugin",
         "--nbval",
         "--nbval-current-env",
@@ -98,12 +100,14 @@ def main() -> int:
     if not notebooks:
         print("the table of contents has no chapter", file=sys.stderr)
         return 1
+    # Without --portable there is one setting: this machine's own.
     codes = []
     for name, (extra, code) in (
         SETTINGS.items() if options.portable else [("", ({}, ""))]
     ):
         if name:
             print(f"under {extra}", flush=True)
+            # The probe shows that the setting reaches the kernels.
             codes.append(compare(probe(name, code), extra))
         with ThreadPoolExecutor(max_workers=options.jobs) as pool:
             codes += pool.map(compare, notebooks, [extra] * len(notebooks))

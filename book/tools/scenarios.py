@@ -26,6 +26,7 @@ def text_of(folder: Path) -> str:
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(COLUMNS)
     for paper in PAPERS:
+        # Sorted, so that the file is the same on every file system.
         for path in sorted((folder / paper).glob("*.toml")):
             scenario = read_scenario(path)
             writer.writerows(

@@ -47,6 +47,7 @@ def load_script(path: Path) -> ModuleType:
     lacking = [name for name in NEEDED if not hasattr(script, name)]
     if lacking:
         raise ValueError(f"{path.name}: has to define {', '.join(lacking)}")
+    # Both names become parts of a path.
     if script.PAPER not in PAPERS:
         raise ValueError(
             f"{path.name}: PAPER needs one of {PAPERS}, got {script.PAPER!r}"
@@ -71,6 +72,7 @@ def parameters_of(script: ModuleType) -> dict[str, Any]:
 
 def changes_of(script: ModuleType) -> str:
     """Describe the differences of a study's scenarios from the accepted ones, or ''."""
+    # Results of a changed scenario must not be stored as the paper's.
     changes = [c for s in getattr(script, "scenarios", ()) for c in s.changes]
     return (
         f"{script.NAME}: changed scenario: {'; '.join(changes)}: make update-scenarios"
@@ -115,6 +117,7 @@ def run(script: ModuleType, root: Path, workers: int | None) -> None:
         code=getattr(script, "code", ()),
         workers=workers,
     )
+    # Reading the file back checks it.
     stored = studies.load(path)
     seconds = time.perf_counter() - start_time
     failed = [f"trial {k}: {kind}" for k, kind in enumerate(stored.failures) if kind]
@@ -137,6 +140,7 @@ def check(script: ModuleType, root: Path, workers: int | None) -> str:
         stored = studies.check(path, script.trial, workers=workers, **options)
     except (AssertionError, ValueError) as error:
         return str(error)
+    # The stored trials agree; now the script must still ask for the same ones.
     if tuple(map(seed_text, script.seeds)) != stored.seeds:
         return f"{file}: the script has other seeds: make studies"
     # Compare as JSON, in which arrays are lists and tuples too.
@@ -160,6 +164,7 @@ def main(arguments: list[str] | None = None, root: Path = ROOT) -> int:
     )
     options = parser.parse_args(arguments)
     all_scripts = scripts(root)
+    # A misspelt name must not pass as "nothing to do".
     unknown = sorted(set(options.names) - {script.NAME for script in all_scripts})
     if unknown:
         print(

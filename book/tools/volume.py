@@ -98,6 +98,7 @@ for (const line of document.querySelectorAll(".contents li:has(a)"))
 
 def key(page: str, name: str = "") -> str:
     """Return the id in the whole book of an id of one page."""
+    # A page's ids get its name as a prefix, since ids of two pages may be equal.
     stem = page.removeprefix("book/").replace("/", "-")
     return f"p{stem}" + (f"--{re.sub(r'[^A-Za-z0-9_.-]', '-', name)}" if name else "")
 
@@ -123,8 +124,11 @@ def article(page: str, pages: list[str]) -> tuple[Tag, list[Tag]]:
     # Ids of all pages are in one document: make them unique by the page's name.
     for node in text.find_all(id=True):
         node["id"] = key(page, str(node["id"]))
+    # Links of the site lead to places of the same document.
     for link in text.find_all("a", href=True):
         lead(link, page, pages)
+    # Relative addresses mean nothing in the assembled file; lazy loading would print
+    # blanks.
     for picture in text.find_all("img"):
         picture["src"] = (path.parent / unquote(str(picture["src"]))).resolve().as_uri()
         del picture["loading"]
@@ -132,6 +136,7 @@ def article(page: str, pages: list[str]) -> tuple[Tag, list[Tag]]:
     for table in text.find_all("table"):
         if len(table.find_all("tr")) > 14:
             table["class"] = [*table.get("class", []), "long"]
+    # Every page becomes a part that begins on a new sheet.
     text.name = "section"
     text.attrs = {"class": ["part"], "id": key(page)}
     return text, [solution.extract() for solution in text.select(".solution")]
@@ -140,6 +145,7 @@ def article(page: str, pages: list[str]) -> tuple[Tag, list[Tag]]:
 def lead(link: Tag, page: str, pages: list[str]) -> None:
     """Redirect a link to its place in the book; a link to a page that is left out becomes text."""
     where, _, name = str(link["href"]).partition("#")
+    # An address outside, such as https:
     if re.match(r"\w+:", where):
         return
     path = posixpath.normpath(posixpath.join(posixpath.dirname(page), where))
@@ -159,6 +165,7 @@ def assemble() -> tuple[str, list[str]]:
     for group in yaml.safe_load((ROOT / "_toc.yml").read_text(encoding="utf-8"))[
         "parts"
     ]:
+        # A group's caption stands before its first chapter.
         captions[group["chapters"][0]["file"]] = group["caption"]
     contents_lines = []
     for page in pages:
@@ -170,6 +177,7 @@ def assemble() -> tuple[str, list[str]]:
             )
         contents_lines += entries(text)
         if solutions:
+            # Solutions are collected at the end, below the titles of their chapters.
             title = text.find("h1").get_text()  # type: ignore[union-attr]
             solution_texts += [
                 f'<h2 id="{key(page, "solutions")}">{html.escape(title)}</h2>',
@@ -183,6 +191,7 @@ def assemble() -> tuple[str, list[str]]:
         (BUILT / f"{page}.html").read_text(encoding="utf-8") for page in pages
     )
     # The settings of the pages hold for the whole book.
+    # All pages have the same settings of MathJax.
     config = re.search(r"<script>(window\.MathJax = .*?)</script>", html_text)
     assert config is not None, "pages have no mathematics"
     mathjax = (BUILT / "_static" / "mathjax" / "tex-mml-chtml.js").as_uri()
@@ -209,6 +218,7 @@ def entries(text: Any) -> list[str]:
     """Return the lines of the contents for one part: its title, and its sections."""
     lines = []
     for head in text.find_all(["h1", "h2"]):
+        # Sphinx puts the id of a section on the element around its heading.
         place = (
             text["id"]
             if head.name == "h1"
@@ -224,6 +234,7 @@ def entries(text: Any) -> list[str]:
 
 def pages_of(pdf: bytes) -> dict[str, int]:
     """Return the page of each place that a link of a PDF by Chromium leads to."""
+    # Chromium writes a PDF without compressed objects, so that a pattern finds them.
     objects = dict(
         re.findall(rb"(?:^|\n)(\d+) 0 obj\n(.*?)\nendobj", pdf, flags=re.DOTALL)
     )
@@ -251,6 +262,7 @@ def print_page(driver: Any) -> bytes:
         '<div style="font: 8px sans-serif; width: 100%; text-align: center">'
         '<span class="pageNumber"></span></div>'
     )
+    # The size of the sheet comes from the style (@page); the foot has the number.
     answer = driver.execute_cdp_cmd(
         "Page.printToPDF",
         {
@@ -268,12 +280,15 @@ def print_page(driver: Any) -> bytes:
 
 def open_page(driver: Any, page: Path) -> None:
     """Open the assembled page and set it; exit if something does not fit."""
+    # Setting all formulas of the book takes minutes.
     driver.command_executor.client_config.timeout = 1800
     driver.set_script_timeout(1700)
     driver.set_page_load_timeout(1700)
     driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    # Wider than the text of a sheet, so that the window does not limit it.
     driver.set_window_size(900, 1000)
     driver.get(page.as_uri())
+    # Sizes are final only after formulas and pictures are there.
     driver.execute_async_script(READY)
     driver.execute_script(FIT)
     problems = driver.execute_script(WRONG)
@@ -290,6 +305,7 @@ def pdf(driver: Any, parts: list[str]) -> bytes:
         sys.exit(
             f"the PDF has not every chapter: {dict(zip(parts, starts, strict=False))}"
         )
+    # Numbers stand at the ends of lines, so that the second print has the same pages.
     driver.execute_script(NUMBER, places)
     return print_page(driver)
 
@@ -311,6 +327,7 @@ def main() -> int:
             target.write_bytes(pdf(driver, parts))
         else:
             colours = (BUILT / "_static" / "pygments.css").read_text(encoding="utf-8")
+            # A reader's paper is white: only the light colours of code are needed.
             light = re.findall(
                 r'^html\[data-theme="light"\] .*', colours, flags=re.MULTILINE
             )
@@ -325,6 +342,7 @@ def offer(target: Path) -> None:
     """Link the name of a file on the first page to the file."""
     first = TARGET / "index.html"
     name = re.escape(target.name)
+    # The first page names the file as code; after this it is a link.
     mention = re.compile(rf'<code[^>]*><span class="pre">{name}</span></code>')
     text = first.read_text(encoding="utf-8")
     first.write_text(

@@ -140,8 +140,9 @@ class FokkerPlanck(FrozenModel):
         across = np.arange(faces.axis.size), faces.axis
         drift = self.swarm.drift_at(faces.points, t)[across]
         diffusion = self.swarm.diffusion_at(faces.points, t)[across]
-        # z = v Δ/D at the face
+        # Péclet number z = v Δ/D at the face
         peclet = drift * faces.width / diffusion
+        # Rates B(-z) D/Δ² forwards and B(z) D/Δ² backwards, with B(z) = z / (exp(z) - 1).
         # B(-z) = z + B(z): one exponential serves both directions, without cancellation.
         weight = bernoulli(np.abs(peclet))
         forwards = weight + np.maximum(peclet, 0.0)

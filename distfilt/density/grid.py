@@ -155,7 +155,7 @@ class Grid(FrozenModel):
 
     @validated
     def histogram(self, positions: Annotated[ArrayInput, "... n self.dim"]) -> Array:
-        """Histogram of agents (..., N, d), one or more, as a density (..., n)."""
+        """Histogram of N agents (..., N, d), N ≥ 1, as a density in the n cells, (..., n)."""
         agents = positions.shape[-2]
         cells = self.cell_index(positions).reshape(-1, agents)
         rows = [np.bincount(row, minlength=self.size) for row in cells]

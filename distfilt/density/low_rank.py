@@ -248,14 +248,16 @@ def low_rank_predict(
     array([[0.5, 0.5]])
     """
     if process is None:
-        # Data are kept apart, in M and b: only the basis and the base move.
+        # The measurements are in M and b of LowRank, which stay. Φ is applied to the basis S and
+        # to `base`, the density without measurements.
         basis, base = _transition_columns(transition, state.basis, state.base)
         return state.replace(basis=basis, base=base)
     if dt is None:
         raise ValueError(
             "dt must be the length of the step if there is process noise, got None"
         )
-    # The data go into the factor L and the estimate, which start anew with M = I and b = 0.
+    # L and the estimate contain the measurements. They become the new S and `base`, with M = I and
+    # b = 0.
     factors, base = _transition_columns(transition, state.factors, state.estimates)
     # √Δ L_Q, the same for all filters
     noise = np.broadcast_to(np.sqrt(dt) * process, (len(base), *process.shape))

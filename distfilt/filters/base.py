@@ -322,7 +322,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         is_single: bool = False,
     ) -> S:
         """Take one step from checked arguments; a single one is not part of a planned run."""
-        # A state of agents with sensors knows its runs from their failures.
+        # `failed` of a SensorState has one entry for each run.
         runs = state.failed.shape if isinstance(state, SensorState) else state.runs
         read = self.read_observations(observations, runs, t)
         matched: Sequence[Observation] = ()

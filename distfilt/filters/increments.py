@@ -258,7 +258,7 @@ class InformationIncrementFilter(TargetMixtureFilter):
         shared: list[Observation] = []
         for observation in observations:
             value = observation.value
-            # The noise of shared components must not tell of the others'.
+            # Correlated noise would let shared components carry information about the others.
             is_shared = np.isin(np.arange(value.size), self.shared_components)
             noise_cov = sensor_of(self, observation).noise_cov
             if noise_cov[np.ix_(is_shared, ~is_shared)].any():

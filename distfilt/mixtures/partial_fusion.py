@@ -251,7 +251,10 @@ class PartialFusion(FrozenModel):
             return _weight_by_values(mixture, np.log(coefficients))
 
     def _log_values_by_source(self, shapes: ComponentShapes) -> Array:
-        """Log density at the shapes' means, with the prior component alone that each came from."""
+        """Log of the fused density at the means of components (`shapes`) that have no weights yet.
+
+        Of the prior's components only the source of each counts, not the sum over all of them.
+        """
         prior = self.prior
         source = shapes.source
         # log w_q N_q(m) = log w_q + log peak_q - ½ |L_q⁻¹ (m - m_q)|²
@@ -259,6 +262,7 @@ class PartialFusion(FrozenModel):
         white = np.linalg.solve(prior.factors[source], differences[..., None])[..., 0]
         log_peaks = (prior.log_weights + prior.log_peaks)[source]
         logs = log_peaks - 0.5 * (white**2).sum(axis=-1)
+        # Times the update factor g(t) of (15), a function of the target t alone.
         return self._add_log_update(logs, shapes.means[:, : self.target_dim], "shapes")
 
     def _collocate(

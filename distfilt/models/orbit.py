@@ -257,7 +257,9 @@ def _derivative(x: Array, t: float, dt: float, bodies: int) -> Array:
 
 @validated
 def rsw_frame(x: Orbits) -> Array:
-    """Axes of the RSW frame, (58): radial, along the motion across the radius, and normal.
+    """Axes of the RSW frame: radial, across it in the direction of motion, and normal to both.
+
+    Equation (58) of Semeraro et al.
 
     Parameters
     ----------

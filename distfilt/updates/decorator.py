@@ -106,6 +106,7 @@ def update(function: F) -> F:
         return cast(Array, call_user(function, **arguments))
 
     checked: Any = validated(function, call=call_checked, annotations=annotations)
+    # A tag, see `has_tag`: it takes a stack of ensembles in one call.
     checked.stacks = True
     return cast(F, checked)
 

@@ -197,6 +197,7 @@ def _convert_array(
     name: str,
     context: CallContext,
 ) -> Any:
+    """Return an array of a dtype and shape; :meth:`Constraint.validate` words a bare TypeError."""
     if dtype is np.float64:
         array: Any = check_array(value, name, finite=not allow_nan)
         if allow_nan and np.isinf(array).any():

@@ -48,7 +48,8 @@ def measure_time(function: Callable[[], Any], repeats: int = 3) -> Timing:
     """
     cpu = []
     result = None
-    # Waiting BLAS threads count as processor time and would hide the cost of small matrices.
+    # Waiting BLAS threads count as processor time and would hide the cost of small
+    # matrices.
     with threadpool_limits(limits=1):
         for _ in range(repeats):
             start = time.process_time()
@@ -70,10 +71,12 @@ def compare_times(
     with threadpool_limits(limits=1):
         calls = {}
         for name, function in functions.items():
+            # The first call fills caches; the second one gives the length of a turn.
             function()
             began = time.perf_counter()
             function()
             calls[name] = max(1, int(seconds / max(time.perf_counter() - began, 1e-7)))
+        # One turn of each function in every round
         for _ in range(rounds):
             for name, function in functions.items():
                 began = time.process_time()
@@ -81,6 +84,7 @@ def compare_times(
                     function()
                 times[name].append((time.process_time() - began) / calls[name])
     first = next(iter(times.values()))
+    # Within a round both meet the same disturbance, which cancels in their ratio.
     ratios = {
         name: statistics.median(b / a for a, b in zip(first, spent, strict=True))
         for name, spent in times.items()
@@ -99,6 +103,7 @@ def peer(name: str) -> Any:
 
 def peak_mb() -> float:
     """Largest resident memory of this process so far, in MB."""
+    # macOS counts bytes, Linux kibibytes.
     unit = 2**20 if sys.platform == "darwin" else 2**10
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
@@ -138,6 +143,7 @@ def versions(packages: Sequence[str]) -> str:
 def write(name: str, rows: Sequence[Row], packages: Sequence[str]) -> None:
     """Print rows, and write them to data/bench/`name`.csv with versions, machine and its load."""
     frame = pandas.DataFrame(rows)
+    # The load may have begun or ended during the measurement.
     busy = max(_BUSY_AT_START, busy_cores())
     print(frame.to_string(index=False))
     path = FOLDER / f"{name}.csv"

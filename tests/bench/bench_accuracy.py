@@ -34,6 +34,7 @@ def pairs(da: Any) -> Iterator[tuple[str, Any, Any, float]]:
     ours = partial(EnsembleFilter, *problem, members=10)
     wider = partial(with_inflation, factor=1.02)
     centred = with_inflation(partial(enkf, centred=True), factor=1.04)
+    # DAPPER's square-root filter is the reference for both deterministic updates.
     rotated = partial(da.EnKF, "Sqrt", N=10, infl=1.02, rot=True)
     yield (
         "centred draws",
@@ -79,14 +80,18 @@ def errors() -> Iterator[Row]:
         dapper.set_seed(9000)
         means = []
         for x, y in draws:
-            (other := make()).assimilate(hmm, x, y, liveplots=False)
+            other = make()
+            other.assimilate(hmm, x, y, liveplots=False)
             means.append(other.stats.mu.a)
         theirs = error(np.stack(means, axis=1))
         ratio_of_all = ours.mean() / theirs.mean()
+        # Runs in which either filter has lost the track would dominate the averages.
         lost, lost_theirs = ((x > 4 * STD).any(axis=0) for x in (ours, theirs))
         ours, theirs = (x.mean(axis=0)[~lost & ~lost_theirs] for x in (ours, theirs))
         ratio = ours.mean() / theirs.mean()
+        # Both filters see the same data: a standard error of paired differences
         se = (ours - theirs).std(ddof=1) / theirs.mean() / ours.size**0.5
+        # Two counts differ by about the square root of the number of lost runs.
         lost_more = (
             lost.sum() - lost_theirs.sum() > 2 * (lost | lost_theirs).sum() ** 0.5
         )

@@ -25,6 +25,7 @@ def case(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Costs and likelihood weights of n members in four dimensions."""
     rng = np.random.default_rng(n)
     x = rng.standard_normal((n, 4))
+    # A likelihood of the first component alone
     w = np.exp(-1.5 * x[:, 0] ** 2)
     return squared_distances(x), w / w.sum()
 
@@ -36,6 +37,7 @@ def solve_by_cvxpy(cost: np.ndarray, w: np.ndarray) -> float:
     n = len(w)
     t = cp.Variable((n, n), nonneg=True)
     scale = cost.max()
+    # Marginals of N T: one equation of the columns follows from the others.
     ends = [cp.sum(t, axis=0)[:-1] == 1.0, cp.sum(t, axis=1) == n * w]
     problem = cp.Problem(cp.Minimize(cp.sum(cp.multiply(cost / scale, t))), ends)
     problem.solve(solver="HIGHS")
@@ -57,6 +59,7 @@ def rows() -> Iterator[Row]:
         times, ratios = compare_times(calls, 5)
         best = calls["network simplex"]()
         spent[n] = times["network simplex"]
+        # d log(time) / d log(N), from the last two sizes
         slope = np.diff(np.log(list(spent.items())[-2:]), axis=0)
         for solver, call in calls.items():
             gap = abs(call() - best)

@@ -65,6 +65,7 @@ def linear_case(
         "R": sensor.noise_cov,
     }
     parts = {"model": model, "sensors": (sensor,), "times": times}
+    # The prior is three off, within its standard deviation of five.
     return (x0 + 3.0, 25.0 * np.eye(6), sensor.observe(truth, rng=rng)), matrices, parts
 
 
@@ -83,6 +84,7 @@ def plain_numpy(mean: Any, cov: Any, y: Any, *, F: Any, H: Any, Q: Any, R: Any) 
     for k, seen in enumerate(y):
         present = ~np.isnan(seen)
         h = H * present[..., None]
+        # R of the present components, and the identity for missing ones
         pairs = present[..., :, None] & present[..., None, :]
         r = np.where(pairs, R, np.eye(len(R)))
         x = x @ F.T
@@ -92,9 +94,9 @@ def plain_numpy(mean: Any, cov: Any, y: Any, *, F: Any, H: Any, Q: Any, R: Any) 
         S = cross @ np.swapaxes(h, 1, 2) + r
         gain = np.swapaxes(np.linalg.solve(S, cross), 1, 2)
         innovation = np.where(present, seen - x @ H.T, 0.0)
-        squares = (innovation * np.linalg.solve(S, innovation[..., None])[..., 0]).sum(
-            axis=-1
-        )
+        whitened = np.linalg.solve(S, innovation[..., None])[..., 0]
+        squares = (innovation * whitened).sum(axis=-1)
+        # log N(y; H x, S) = -½ (m log 2π + log |S| + dᵀ S⁻¹ d)
         log_two_pi = present.sum(axis=-1) * np.log(2 * np.pi)
         density[k] = -0.5 * (log_two_pi + np.linalg.slogdet(S)[1] + squares)
         x = x + (gain @ innovation[..., None])[..., 0]
@@ -109,6 +111,7 @@ def plain_numpy(mean: Any, cov: Any, y: Any, *, F: Any, H: Any, Q: Any, R: Any) 
 def turning_case(
     rng: np.random.Generator,
 ) -> tuple[tuple[np.ndarray, ...], dict[str, Any]]:
+    # A turn seen by a sensor some way off: range and bearing are both curved.
     model = turning(sigma=0.1, turn_sigma=0.02)
     sensors = (range_bearing([0, 1], std=(0.3, 0.02), origin=[-9.0, -7.0]),)
     x0 = np.array([0.0, 0.0, 1.0, 0.5, 0.1])
@@ -143,6 +146,7 @@ def compare_filters(
     first_means, first_covs = results["distfilt"]
     for name, (means, covs) in results.items():
         difference = np.abs(means - first_means).max() / np.abs(first_means).max()
+        # The library keeps one covariance for all runs where they are equal.
         covs = covs.reshape(len(covs), -1, *covs.shape[-2:])
         expected = first_covs.reshape(len(covs), -1, *covs.shape[-2:])
         difference = max(
@@ -164,6 +168,7 @@ def compare_filters(
 def filters() -> Iterator[Row]:
     rng = np.random.default_rng(20260)
     (mean, cov, observed), matrices, parts = linear_case(rng)
+    # A tenth of all components is missing, in each run another one.
     with_gaps = np.where(rng.random(observed.shape) < 0.1, np.nan, observed)
     # Spare filterpy the density of each observation.
     filterpy.KalmanFilter.log_likelihood = (

@@ -20,6 +20,7 @@ def mixture(size: int, dim: int, seed: int = 0) -> GaussianMixture:
     """Uneven weights, means in a cloud, full covariances."""
     rng = np.random.default_rng(seed + 1000 * dim + size)
     roots = 0.4 * rng.standard_normal((size, dim, dim)) + 0.6 * np.eye(dim)
+    # R Rᵀ + 0.1 I is positive definite.
     covs = roots @ np.swapaxes(roots, -1, -2) + 0.1 * np.eye(dim)
     w = rng.dirichlet(np.ones(size))
     return GaussianMixture(w, 3 * rng.standard_normal((size, dim)), covs)
@@ -29,6 +30,7 @@ def largest_difference(
     ours: GaussianMixture, weights: Any, means: Any, covs: Any
 ) -> float:
     """Return the largest relative difference of two mixtures, whatever their order."""
+    # Weights are all different, so that sorting by them pairs the components.
     order = np.argsort(ours.weights)
     their_order = np.argsort(weights)
     pairs = ((ours.weights, weights), (ours.means, means), (ours.covs, covs))

@@ -50,6 +50,7 @@ MEGABYTES = 500.0
 def spread(agents: int, neighbours: float = 10) -> tuple[np.ndarray, float]:
     """Return positions in the unit square, and a range that gives about that many neighbours."""
     places = np.random.default_rng(agents).random((agents, 2))
+    # A disk of radius r holds about π r² A of A agents in the unit square.
     return places, float(np.sqrt(neighbours / np.pi / agents))
 
 
@@ -91,9 +92,11 @@ def many() -> Iterator[Row]:
             ("Gaussian", GaussianFilter(MODEL, sensors, graph, fusion=ours)),
             ("ensemble, 50 members", EnsembleFilter(MODEL, sensors, graph, **options)),
         ):
+            # The first step fills caches: the second one is timed.
             state = f.step(f.start(PRIOR, rng=np.random.default_rng(2)), 0.1, seen)
             spent = measure_time(partial(f.step, state, 0.2, seen), 5)
             yield scale_row(f"a step, {name}, {rule}", agents, spent, limit)
+    # A process of its own, so that its peak memory is that of one operation
     for operation in ("combine", "max_stable_gain", "balanced"):
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             agents, spent = pool.submit(measure_operation, operation).result()
@@ -106,6 +109,7 @@ def many() -> Iterator[Row]:
 
 def import_times(*names: str) -> list[float]:
     """Return the time of a process that imports each module, in s: medians of fifteen, in turns."""
+    # In turns, so that a disturbance of the machine meets both imports.
     taken: dict[str, list[float]] = {name: [] for name in names}
     for name in names * 15:
         began = time.perf_counter()
@@ -123,6 +127,7 @@ def one_way() -> Graph:
     receivers = np.repeat(np.arange(VERY_MANY), [len(f) for f in neighbours])
     edges = np.stack([receivers, np.concatenate(neighbours)], axis=1)
     edges = edges[edges[:, 0] != edges[:, 1]]
+    # Balanced weights need a strongly connected graph: the largest component is kept.
     parts = Graph.from_edges(VERY_MANY, edges, directed=True).components
     in_largest = parts == np.bincount(parts).argmax()
     renumbered = (np.cumsum(in_largest) - 1)[edges[in_largest[edges].all(axis=1)]]

@@ -32,6 +32,7 @@ MODEL = LinearModel.from_transition(3, lambda dt: np.eye(3), lambda t, dt: dt * 
 
 def by_distfilt(n: int, seen: np.ndarray) -> np.ndarray:
     sensor = Sensor(2, lambda x: x @ H.T, R, linear=lambda d: H)
+    # A threshold of 1 resamples in every step.
     f = ParticleFilter(MODEL, [sensor], members=n, ess_threshold=1.0)
     states = f.steps(
         f.start((np.zeros(3), np.eye(3)), rng=np.random.default_rng(1)), TIMES, [seen]
@@ -46,6 +47,7 @@ def by_particles(package: Any, n: int, seen: np.ndarray) -> np.ndarray:
 
     class Walk(spaces.StateSpaceModel):  # type: ignore[misc,name-defined]
         def PX0(self) -> Any:
+            # The package observes the first state, ours begins one step before.
             return laws.MvNormal(loc=np.zeros(3), cov=np.eye(3) + Q)
 
         def PX(self, t: int, xp: Any) -> Any:
@@ -70,6 +72,7 @@ def filters() -> Iterator[Row]:
     rng = np.random.default_rng(5)
     truth = simulate(MODEL, np.zeros(3), TIMES, rng=rng)
     seen = truth @ H.T + rng.standard_normal((STEPS, 2)) @ np.linalg.cholesky(R).T
+    # The model is linear: the exact means are those of the Kalman filter.
     exact = kalman_filter(np.zeros(3), np.eye(3), seen, F=np.eye(3), H=H, Q=Q, R=R)
     variance = np.diagonal(exact.covariances, axis1=-2, axis2=-1)
     package = peer("particles")

@@ -34,12 +34,15 @@ def anomalies(x: np.ndarray) -> np.ndarray:
     return x - x.mean(axis=-2, keepdims=True)
 
 
-def exact_draws(z: np.ndarray, avoid: np.ndarray) -> np.ndarray:
+def exact(z: np.ndarray, avoid: np.ndarray) -> np.ndarray:
     """Normal draws (..., N, k) made uncorrelated with anomalies and of unit sample covariance."""
-    # A linear sensor's predictions depend on the members, so that normal equations are singular.
+    # A linear sensor's predictions depend on the members, so that normal equations are
+    # singular.
     frame = np.linalg.qr(avoid)[0]
     z = anomalies(z)
+    # z - Q Qᵀ z has no part along the anomalies to avoid.
     z -= frame @ (frame.mT @ z)
+    # Divide by the factor of the sample covariance, which makes it I.
     root = np.linalg.cholesky(z.mT @ z / (z.shape[-2] - 1))
     return z @ np.linalg.inv(root).mT
 
@@ -51,8 +54,10 @@ def plain_step(
     n = states.shape[-2] - 1
     dt = float(setup.times[1] - setup.times[0])
     values, vectors = np.linalg.eigh(setup.model.Q(0.0, dt))
+    # Q is singular: no noise acts on the quaternion.
     positive = values > 1e-14 * values.max()
     root = vectors[:, positive] * np.sqrt(values[positive])
+    # receives[k, j]: agent k knows its own belief and those of its neighbours.
     receives = np.eye(len(setup.sensors)) + (setup.graph.laplacian.toarray() < 0)
     received_sensors = [
         [s for s, row in zip(setup.sensors, rows, strict=True) if row]
@@ -71,17 +76,19 @@ def plain_step(
 
     def draw(avoid: np.ndarray, k: int) -> np.ndarray:
         z = rng.standard_normal((*avoid.shape[:-1], k))
-        return exact_draws(z, avoid) if kind == "exact" else z
+        return exact(z, avoid) if kind == "exact" else z
 
     def call() -> np.ndarray:
         x = setup.model.step(states, 0.0, dt)
+        # Forecast with additive noise
         x = x + draw(anomalies(x), root.shape[1]) @ root.T
         for k in range(len(received_sensors)):
             h = predict(k, x[:, k], states[:, k])
             a = anomalies(x[:, k])
             b = anomalies(h)
             m = h.shape[-1]
-            # K = (BᵀB / (N - 1) + I)⁻¹ BᵀA / (N - 1); predictions are in units of the noise
+            # K = (BᵀB / (N - 1) + I)⁻¹ BᵀA / (N - 1); predictions are in units of the
+            # noise
             gain = np.linalg.solve(b.mT @ b / n + np.eye(m), b.mT @ a / n)
             x[:, k] -= (h + draw(np.concatenate([a, b], axis=-1), m)) @ gain
         a = anomalies(x)
@@ -96,6 +103,7 @@ def plain_step(
                 sources, rule=rule, present=receives > 0
             )
         else:
+            # The trace rule: w_j ∝ 1 / Tr P_j
             weights = receives / np.trace(covs, axis1=-2, axis2=-1)[:, None]
             weights /= weights.sum(axis=-1, keepdims=True)
         # Covariance intersection: P⁻¹ = Σ w P_j⁻¹

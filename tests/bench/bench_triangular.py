@@ -35,6 +35,7 @@ CALLS = 200
 def partly_observed(m: int, d: int) -> tuple[np.ndarray, np.ndarray]:
     """Correlated members of unit scale and noisy observations of them."""
     rng = np.random.default_rng(100 * m + d)
+    # A mild correlation, whatever the dimension
     mixing = np.eye(d) + 0.3 * rng.standard_normal((d, d)) / np.sqrt(d)
     x = rng.standard_normal((SAMPLES, d)) @ mixing
     return x[:, :m] + 0.5 * rng.standard_normal((SAMPLES, m)), x
@@ -52,6 +53,7 @@ def programs() -> Iterator[Row]:
         known = partial(affine.fit_convex, y, x, solver="ECOS")
 
         def newcomer(known: Callable[[], Any] = known) -> Any:
+            # Forget the compiled programs before each call.
             affine._compile_program.cache_clear()
             return known()
 
@@ -83,6 +85,7 @@ COMMIT = "7fe9d080e810c65201f521e805e5d66b11512a14 of 2025-07-17"
 
 def prior(n: int, rng: np.random.Generator) -> np.ndarray:
     x = rng.standard_normal((n, 3))
+    # A parabola in the first two components, and a fold in the third
     x[:, 1] += 0.5 * x[:, 0] ** 2
     x[:, 2] += 0.5 * x[:, 1] * np.sign(x[:, 0])
     return x
@@ -90,6 +93,7 @@ def prior(n: int, rng: np.random.Generator) -> np.ndarray:
 
 def exact_mean() -> np.ndarray:
     x = prior(2_000_000, np.random.default_rng(99))
+    # Importance sampling from the prior with the likelihood as weights
     w = np.exp(-0.5 * ((SEEN - x[:, 0]) / STD) ** 2)
     return (w @ x) / w.sum()
 
@@ -143,6 +147,7 @@ class Toolbox:
 
 
 def error(update: Any, mean: np.ndarray) -> float:
+    # Root mean square of the error of the posterior mean, over seeds and components
     gaps = [update(*bent_samples(seed)).mean(axis=0) - mean for seed in range(SEEDS)]
     return float(np.sqrt(np.mean(np.square(gaps))))
 

@@ -37,7 +37,10 @@ def analysis_case(d: int) -> tuple[np.ndarray, ...]:
     a = rng.standard_normal((d, d)) / np.sqrt(d)
     b = rng.standard_normal((m, m)) / np.sqrt(m)
     x = rng.standard_normal((MEMBERS, d)) @ (np.eye(d) + a)
-    return x, x[:, :m].copy(), rng.standard_normal(m), b @ b.T + 0.5 * np.eye(m)
+    # The first half of the components is observed.
+    predicted = x[:, :m].copy()
+    noise = b @ b.T + 0.5 * np.eye(m)
+    return x, predicted, rng.standard_normal(m), noise
 
 
 def six_lines(
@@ -48,6 +51,7 @@ def six_lines(
     n = len(x) - 1
     cov = b.T @ b / n + r
     drawn = h + rng.standard_normal(h.shape) @ np.linalg.cholesky(r).T
+    # K = (BᵀB / (N - 1) + R)⁻¹ BᵀA / (N - 1)
     gain = np.linalg.solve(cov, b.T @ a / n)
     return x + (y - drawn) @ gain
 
@@ -71,6 +75,7 @@ def dapper_s_loop(
 
     def loop() -> None:
         hmm = setup.HMM
+        # Forecast, noise, analysis and inflation by 1, as in DAPPER's own loop
         e = x.copy()
         for k, seen in enumerate(y):
             e = methods.add_noise(hmm.Dyn(e, k * DT, DT), DT, hmm.Dyn.noise, "Stoch")
@@ -126,6 +131,7 @@ def analyses_and_cycles() -> Iterator[Row]:
         sensor = component(range(d), std=variance**0.5)
         rng = np.random.default_rng(d)
         times = DT * np.arange(1, CYCLES + 1)
+        # After a hundred units of time the state is on the attractor.
         x0 = model.step(rng.standard_normal(d), 0.0, 100.0)
         y = sensor.observe(simulate(model, x0, times, rng=rng), rng=rng)
         f = EnsembleFilter(model, [sensor], members=MEMBERS)

@@ -30,10 +30,12 @@ OWN = (
     "devtools://",
     "about:",
 )
+# Events of the log that stand for a request
 ASKS = ("Network.requestWillBeSent", "Network.webSocketCreated")
 WIDTHS = (1440, 1200, 400)
 THEMES = ("light", "dark")
 # Opens folded parts, then reports raw markup, formulas that are not set and broken pictures.
+# Raw markup is searched in visible text only: code may show it.
 REPORT = r"""
 document.querySelectorAll("details").forEach(d => { d.open = true; });
 const raw = [];
@@ -132,11 +134,14 @@ def visit(driver: Any, page: Path) -> Visit:
     # Leave the last page, which would be laid out again at each width.
     driver.get("about:blank")
     for kind in ("performance", "browser"):
+        # Reading a log empties it: the last page's entries go.
         driver.get_log(kind)
     fit: dict[int, dict[str, Any]] = {}
     for width in WIDTHS:
+        # The width is that of the layout, whatever the window's own.
         size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
         driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        # The page is loaded once, at the largest width.
         if not fit:
             driver.get(page.as_uri())
             driver.execute_async_script(READY)
@@ -159,6 +164,7 @@ def requests_of(entries: list[dict[str, Any]], tab: str) -> list[str]:
     The log has the events of all tabs, also of those that Chromium opens for itself. A new tab
     first shows a page of Chromium.
     """
+    # Entries without a tab belong to the one that is asked for.
     sent = [entry["message"] for entry in entries if entry.get("webview", tab) == tab]
     parameters = [message["params"] for message in sent if message["method"] in ASKS]
     urls = [params.get("request", params)["url"] for params in parameters]
@@ -169,6 +175,7 @@ def requests_of(entries: list[dict[str, Any]], tab: str) -> list[str]:
 def chromium(profile: Path, **logs: str) -> Iterator[Any]:
     """Yield a headless Chromium; without one the test is skipped, or fails in `CI`."""
     if browser.find_browser() is None:
+        # A missing browser must not pass unnoticed where the tests are the gate.
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(
             browser.NOT_INSTALLED
         )
@@ -182,6 +189,7 @@ def driver(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     profile = tmp_path_factory.mktemp("profile")
     with chromium(profile, performance="ALL", browser="ALL") as browser_driver:
         browser_driver.set_script_timeout(60)
+        # The page behaves as if it had the focus, also in a headless browser.
         browser_driver.execute_cdp_cmd(
             "Emulation.setFocusEmulationEnabled", {"enabled": True}
         )
@@ -199,6 +207,7 @@ def redirect(page: Path) -> Path | None:
 
 def content_pages() -> list[Path]:
     """Return every page of the built book that is not a redirection."""
+    # Files below _static are parts of packages, not pages.
     pages = sorted(p for p in BUILT.rglob("*.html") if "_static" not in p.parts)
     assert pages, "the book is not built: make book"
     return [page for page in pages if redirect(page) is None]
@@ -220,6 +229,7 @@ def visits(driver: Any) -> dict[Path, Visit]:
 def broken_links(pages: list[Path]) -> list[str]:
     """Return the links to files or anchors that do not exist."""
     texts = {page: page.read_text(encoding="utf-8") for page in pages}
+    # An anchor is an id, or a name in older HTML.
     anchors = {
         page: set(re.findall(r'\s(?:id|name)="([^"]+)"', text))
         for page, text in texts.items()
@@ -229,6 +239,7 @@ def broken_links(pages: list[Path]) -> list[str]:
         for link in set(re.findall(r'<a\s[^>]*?href="([^"]*)"', text)):
             url, anchor = urldefrag(unquote(html.unescape(link)))
             target = Path(os.path.normpath(page.parent / url)) if url else page
+            # Links to other sites are not followed: the tests need no network.
             if not urlparse(url).scheme and (
                 not target.is_file()
                 or (anchor and anchor not in anchors.get(target, {anchor}))
@@ -243,8 +254,11 @@ def outside(page_visit: Visit) -> list[str]:
 
 
 def test_no_request_leaves_the_machine(visits: dict[Path, Visit]) -> None:
+    # The first page is reached from the top, and every page asks for something: the log
+    # works.
     assert redirect(BUILT / "index.html") == BUILT / "book" / "index.html"
     assert all(page_visit.requests for page_visit in visits.values())
+    # Fonts, MathJax and pictures all come from the book's own folder.
     assert {
         p.name: outside(page_visit)
         for p, page_visit in visits.items()
@@ -253,6 +267,7 @@ def test_no_request_leaves_the_machine(visits: dict[Path, Visit]) -> None:
 
 
 def test_console_has_no_error(visits: dict[Path, Visit]) -> None:
+    # A script that fails writes an error to the console.
     assert {
         p.name: page_visit.console
         for p, page_visit in visits.items()
@@ -262,6 +277,7 @@ def test_console_has_no_error(visits: dict[Path, Visit]) -> None:
 
 @pytest.mark.parametrize("key", ["raw", "unset", "merror", "flat", "broken", "mute"])
 def test_mathematics_and_figures_are_shown(visits: dict[Path, Visit], key: str) -> None:
+    # Each key lists the faults of one kind, see REPORT.
     assert {
         page.name: v.report[key] for page, v in visits.items() if v.report[key]
     } == {}
@@ -276,17 +292,21 @@ def test_every_page_fits_and_on_a_desk_scrolls_in_no_box(
 ) -> None:
     for page, page_visit in visits.items():
         for width, fit in page_visit.fit.items():
+            # On a phone wide code may scroll in its box; on a desk nothing has to.
             assert fit["over"] == 0 and fit["cut"] == [], f"{page.name} at {width}"
             assert width < 1200 or fit["scrolls"] == [], f"{page.name} at {width}"
 
 
 @pytest.mark.parametrize("theme", THEMES)
 def test_every_page_is_accessible(visits: dict[Path, Visit], theme: str) -> None:
+    # Contrast depends on the theme, so both are tested.
     assert {p.name: v.rules[theme] for p, v in visits.items() if v.rules[theme]} == {}
 
 
 def test_every_slider_moves_and_plays(visits: dict[Path, Visit]) -> None:
     for source in chapters():
+        # As many sliders as the source draws, and each of them ready, moved, played and
+        # drawn
         drawn = source.read_text(encoding="utf-8").count("plotting.slider(")
         moved = visits[BUILT / "book" / f"{source.stem}.html"].sliders
         assert len(moved) == drawn and all(all(s.values()) for s in moved), (
@@ -316,10 +336,12 @@ def test_every_fault_of_a_bad_page_is_reported(driver: Any, tmp_path: Path) -> N
         and page_visit.report["unset"]
         and page_visit.report["mute"]
     )
+    # A test of the tests: each of the page's faults must be in exactly one report.
     assert len(page_visit.report["broken"]) == 3
     assert len(broken_links([page])) == 2
     assert outside(page_visit) and page_visit.console
     assert (
+        # One listing is cut by its box, the other one scrolls.
         len(page_visit.fit[1200]["cut"]) == 1
         and len(page_visit.fit[1200]["scrolls"]) == 1
     )

@@ -12,10 +12,12 @@ import execute
 from common import ROOT, VERDICT, fixed_environment
 
 PAGES = ("04-satellite-network.md", "04b-five-agents-and-a-pose.md")
+# A link has two ends: a change of one alone would be refused.
 LINKS = (
     ('neighbours = ["A", "B"]', 'neighbours = ["A", "B", "C"]'),
     ('neighbours = ["A", "C"]', 'neighbours = ["A", "B", "C"]'),
 )
+# A sensor that measures a length instead of an angle has another unit too.
 SENSOR = (
     (
         'kind = "line_angle"\nnoise = 0.2\nunit = "rad"',
@@ -33,6 +35,7 @@ def copy_chapter(target: Path, changes: tuple[tuple[str, str], ...]) -> Path:
     path = target / "data" / "scenarios" / "grange" / "table-2.toml"
     text = path.read_text(encoding="utf-8")
     for old, new in changes:
+        # A change that finds no text would test the unchanged chapter.
         assert text.count(old) == 1
         text = text.replace(old, new)
     path.write_text(text, encoding="utf-8")
@@ -58,19 +61,24 @@ def test_a_changed_scenario_runs_to_the_end_and_is_not_compared(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     folder = copy_chapter(tmp_path, changes)
+    # As for a reader: a statement that no longer holds prints, and the notebook runs
+    # on.
     lenient = {k: v for k, v in fixed_environment().items() if k != "BOOK_STRICT"}
     monkeypatch.setattr(execute, "fixed_environment", lambda: lenient)
     results = {}
     for page in PAGES:
         notebook = execute.read(folder / page)
         execute.run(notebook, folder)
+        # It raised nothing, and warned of nothing.
         assert execute.complaints(notebook) == []
         results |= verdicts(notebook)
+    # Items that use the changed scenario cannot be compared with the paper ...
     for item in ("Table II", "Fig. 1"):
         verdict, why = results[item]
         assert verdict == "not comparable" and why.startswith(
             "changed scenario: agents."
         )
+    # ... the table of another scenario is read as before.
     assert (
         results["Table III"][0] == "read" and results["Fig. 2"][0] == "not comparable"
     )

@@ -21,6 +21,7 @@ PAGE = (ROOT / "book" / "cluster.md").read_text(encoding="utf-8")
 LOCAL, SCHEDULER, WORKERS, DASK, MPI, PARTS = re.findall(
     r"^```sh\n(.*?)\n```$", PAGE, re.M | re.S
 )
+# Trial 20 can kill its worker, and trials can be held until a test has looked.
 BESIDE = """
 import os, signal, time
 from pathlib import Path
@@ -48,6 +49,7 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run the page's script in two parts; each trial reports its start to a local module."""
     folder = tmp_path_factory.mktemp("page")
     text = (ROOT / "book" / "examples" / "cluster.py").read_text(encoding="utf-8")
+    # One step of the filter in place of ten, and a report of each trial's start
     for old, new in [
         ("import sys\n", "import beside\nimport sys\n"),
         ("[5:,", "[:,"),
@@ -58,6 +60,7 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
         text = text.replace(old, new)
     (folder / "cluster.py").write_text(text, encoding="utf-8")
     count_starts(folder)
+    # One worker: nothing of this reference depends on the order of trials.
     one = ENVIRONMENT | {"LOKY_MAX_CPU_COUNT": "1"}
     subprocess.run(["sh", "-ec", PARTS], cwd=folder, env=one, check=True)
     return folder
@@ -112,6 +115,7 @@ def start_counts(folder: Path) -> list[int]:
 
 def kill_after(n: int, folder: Path, start: Start, command: str, *victims: Any) -> str:
     """Kill processes, by default the client, after n trials; return the client's output."""
+    # Trials from number n on wait, so that the client is killed while they run.
     hold = folder / "log" / f"hold.{n}"
     hold.touch()
     client = start(command)
@@ -119,6 +123,7 @@ def kill_after(n: int, folder: Path, start: Start, command: str, *victims: Any) 
         time.sleep(0.01)
     for victim in victims or [client]:
         os.killpg(victim.pid, signal.SIGKILL)
+    # A killed client leaves a part, and no file that looks complete.
     assert client.wait(300) != 0 and not (folder / "errors.csv").exists()
     hold.unlink()
     return (folder / "output").read_text()
@@ -128,6 +133,7 @@ def same(folder: Path, script: Path, twice: int) -> None:
     """Check that the file is the same, and that at most so many trials ran twice."""
     assert (folder / "errors.csv").read_bytes() == (script / "errors.csv").read_bytes()
     assert not (folder / "errors.csv.part").exists()
+    # Every trial ran; only those in flight at a kill may have run again.
     assert len(start_counts(folder)) == 40 and sum(start_counts(folder)) <= 40 + twice
 
 

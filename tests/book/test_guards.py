@@ -34,6 +34,7 @@ SMALL = Path(__file__).parent / "fixtures" / "small.md"
 
 def tool(name: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """Run one of the book's tools as the Makefile does."""
+    # A process of its own, so that exit codes and stderr are those of `make`.
     command = [sys.executable, str(TOOLS / name), *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
 
@@ -63,6 +64,7 @@ def execution(executed_folder: Path) -> subprocess.CompletedProcess[str]:
         path.write_text(
             text.split("```")[0] + code if lines else text, encoding="utf-8"
         )
+        # A rejected chapter must leave this file alone.
         path.with_suffix(".ipynb").write_text("as it was")
     return tool("execute.py", *sources)
 
@@ -76,6 +78,7 @@ def executed(execution: object, executed_folder: Path) -> Path:
 @pytest.fixture
 def chapter(executed: Path, folder: Path) -> Path:
     """Return a fresh copy of the executed small chapter."""
+    # Executing is slow; each test changes a copy of one execution.
     for name in ("small.md", "small.ipynb"):
         shutil.copy(executed / name, folder)
     return folder / "small.md"
@@ -107,6 +110,8 @@ def shade_pixels(png: str, share: float, by: int) -> str:
     image = Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB")
     pixels = np.asarray(image).astype(int)
     chosen = np.random.default_rng(1).random(pixels.shape[:2]) < share
+    # Bright pixels become darker and dark ones brighter, so that no shade leaves
+    # 0..255.
     pixels[chosen] += np.where(pixels[chosen] > 127, -by, by)
     return as_png(pixels)
 
@@ -127,7 +132,9 @@ def exchange_frames(cell: Any) -> None:
     assert (
         len(frames) == 4 and frames[0] == frames[2]
     )  # the first one shown, then all three
+    # Equal frames could be exchanged without any difference.
     assert len(set(frames)) == 3
+    # Exchange two frames by way of a mark; the text around the frames stays.
     swapped = (
         data["text/html"].replace(frames[1], "first").replace(frames[3], frames[1])
     )
@@ -147,6 +154,7 @@ def exchange_picture(cell: Any) -> None:
     bundle(cell)["image/png"] = shade_pixels(bundle(cell)["image/png"], 0.1, 120)
 
 
+# The small chapter's cells, in order
 PRINT, FIGURE, SLIDER, VERDICT = range(4)
 FAULTS: dict[str, tuple[int, Callable[[Any], object], str]] = {
     "digit": (PRINT, lambda c: c.outputs[0].update(text="rate 2.0001\n"), "2.0001"),
@@ -184,6 +192,7 @@ def test_one_changed_output_or_source_fails_and_no_other(
     # The unchanged cells come first, then one changed cell for each fault.
     cells = code_cells(read_notebook(executed / "small.md"))
     untouched = len(cells)
+    # Without a fault no check complains: later complaints are due to the changes alone.
     assert pairs.check(executed / "small.md") == []
     for which, change, _ in FAULTS.values():
         cells.append(nbformat.from_dict(cells[which]))
@@ -195,11 +204,13 @@ def test_one_changed_output_or_source_fails_and_no_other(
     )
     result = tool("regress.py", store(folder / "broken.md", notebook))
     assert result.returncode == 1 and "broken: differs" in result.stdout
+    # pytest prints one block for each cell that differs; text and number alternate.
     parts = re.split(r"^_+ .*Cell (\d+) _+$", result.stderr, flags=re.M)
     messages = dict(zip(map(int, parts[1::2]), parts[2::2], strict=True))
     expected = {
         k: text for k, (*_, text) in enumerate(FAULTS.values(), untouched) if text
     }
+    # Exactly the faulty cells differ, each with the message of its fault.
     assert set(messages) == set(expected)
     assert [k for k, text in expected.items() if text not in messages[k]] == []
 
@@ -215,12 +226,14 @@ def test_pixels_may_differ_if_few_or_little(executed: Path) -> None:
 def test_a_lighter_picture_shows_the_same() -> None:
     # Noise of 64 colours fits a palette, noise of all colours does not.
     noise = np.random.default_rng(1).integers(0, 256, (200, 200, 3))
+    # 4 shades of 3 colours make 64.
     few_colours = as_png(noise // 64 * 80)
     many_colours = as_png(noise)
     assert (
         len(shrink_picture(few_colours)) < 0.9 * len(few_colours)
         and difference(shrink_picture(few_colours), few_colours) == ""
     )
+    # Shrinking twice is shrinking once, so that stored bytes do not change.
     assert shrink_picture(many_colours) == many_colours and shrink_picture(
         shrink_picture(few_colours)
     ) == shrink_picture(few_colours)
@@ -257,6 +270,7 @@ def test_a_stored_output_is_rejected(
     notebook = read_notebook(chapter)
     change(code_cells(notebook))
     store(chapter, notebook)
+    # Also complaints of the other checks may be there.
     assert complaint in "\n".join(pairs.check(chapter))
 
 
@@ -278,18 +292,22 @@ def test_new_sources_keep_the_outputs_and_are_checked(
 ) -> None:
     before = read_notebook(chapter)
     text = chapter.read_text(encoding="utf-8")
+    # A change of the Markdown alone is a difference from the notebook.
     assert text.count(old) == 1
     chapter.write_text(text.replace(old, new), encoding="utf-8")
     assert "differs between the Markdown and the notebook" in "\n".join(
         pairs.check(chapter)
     )
+    # Copying the cells repairs the pair, and keeps the outputs.
     assert execute.copy_sources(chapter) == ""
     after = read_notebook(chapter)
     assert [c.get("outputs") for c in before.cells] == [
         c.get("outputs") for c in after.cells
     ]
+    # The new source has a fault of its own, which is still seen.
     (problem,) = pairs.check(chapter)
     assert complaint in problem
+    # With one more cell, outputs would belong to other cells.
     chapter.write_text(
         text + "\n```{code-cell} ipython3\n1 + 1\n```\n", encoding="utf-8"
     )
@@ -305,9 +323,11 @@ REJECTED = {
 
 def test_execution_rejects(execution: Any, executed: Path) -> None:
     assert execution.returncode == 1 and "failed: a cell failed" in execution.stderr
+    # One block for each output that cannot be stored
     cells = re.split(r"^cell [\w-]+:\n", execution.stderr, flags=re.M)[1:]
     for cell, (line, complaint) in zip(cells, REJECTED.items(), strict=True):
         assert cell.startswith(line) and complaint in cell
+    # Both chapters were executed, and neither was stored.
     unchanged = {
         path.stem
         for path in executed.glob("*.ipynb")
@@ -323,6 +343,7 @@ def test_executing_again_gives_the_same_bytes(
 ) -> None:
     path = chapter.with_suffix(".ipynb")
     text = path.read_text(encoding="utf-8")
+    # The strictest comparison, of a second execution with the stored bytes
     result = tool("execute.py", "--bytes", executed / "small.md")
     assert (
         result.returncode == 0 and result.stderr == "" and "widget-state+json" in text
@@ -331,6 +352,7 @@ def test_executing_again_gives_the_same_bytes(
         "version" not in read_notebook(chapter)["metadata"]["language_info"]
         and str(ROOT) not in text
     )
+    # A stored digit that is wrong must be found. No second kernel is needed for that.
     path.write_text(text.replace("rate 2.0000", "rate 2.0001"), encoding="utf-8")
     monkeypatch.setattr(
         execute, "run", lambda new, _: new.update(read_notebook(executed / "small.md"))
@@ -338,5 +360,6 @@ def test_executing_again_gives_the_same_bytes(
     monkeypatch.setattr(execute.os, "environ", dict(execute.os.environ))
     assert "does not give the stored bytes" in execute.execute(chapter, True, True)
     notebook = nbformat.reads(text, as_version=4)
+    # Texts are equal; only the pixels tell.
     exchange_picture(code_cells(notebook)[FIGURE])
     assert "pixels" in execute.unlike(text, execute.dump(notebook), False)

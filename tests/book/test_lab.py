@@ -37,6 +37,7 @@ def test_every_chapter_is_one_notebook_and_every_page_is_there(
     working_copy: Path,
 ) -> None:
     files = {p.name for p in (working_copy / "book").iterdir() if p.is_file()}
+    # A chapter is there once: as a notebook, without its Markdown.
     assert files == {
         lab.file_of(Path(page).name) for page in toc_pages() if "/api/" not in page
     }
@@ -50,6 +51,7 @@ def test_no_role_is_left_and_no_label_is_lost(working_copy: Path) -> None:
     n_labels = 0
     for source in chapters():
         text = prose(working_copy / "book" / f"{source.stem}.ipynb")
+        # JupyterLab shows roles and directives of MyST as raw text.
         assert not lab.ROLE.search(text) and "{math}" not in text
         assert "solution-" not in text
         stored = nbformat.read(source.with_suffix(".ipynb"), as_version=4)
@@ -59,6 +61,7 @@ def test_no_role_is_left_and_no_label_is_lost(working_copy: Path) -> None:
             if c.cell_type == "markdown"
             for x in lab.labels_of(c.source)
         ]
+        # Each labelled equation has a number, which references name.
         assert text.count("\\tag{") == len(labels)
         n_labels += len(labels)
         figures = [
@@ -74,6 +77,7 @@ def test_numbers_are_those_of_the_built_book() -> None:
     numbers = {}
     for source in chapters():
         html = (BUILT / f"{source.stem}.html").read_text(encoding="utf-8")
+        # Two programs count the equations: Sphinx for the pages, `lab` for the copy.
         numbers |= re.findall(
             r'id="equation-([\w-]+)">\s*<span class="eqno">(\([\d.]+\))', html
         )
@@ -100,6 +104,7 @@ def test_words_for_citations_and_places() -> None:
         "$$\nx = 1\n\\tag{4.1}\n$$\n\n$$\ny = 2\n$$\n"
         "[one](01-bayes-and-kalman.ipynb)"
     )
+    # On another page the reference becomes a link to the chapter.
     other = lab.plain("{eq}`eq-sat-step`", "notation", names, refs)
     assert other == "[(4.1)](04-satellite-network.ipynb)"
 
@@ -111,6 +116,8 @@ def test_outputs_are_trusted_hidden_code_is_folded_and_no_save_writes_a_second_f
     for path in (working_copy / "book").glob("*.ipynb"):
         notebook = nbformat.read(path, as_version=4)
         nbformat.validate(notebook)
+        # Without the pairing JupyterLab cannot write a Markdown file beside the
+        # notebook.
         assert "jupytext" not in notebook.metadata
         assert notary.check_signature(notebook)
         for cell in notebook.cells:
@@ -121,6 +128,7 @@ def test_outputs_are_trusted_hidden_code_is_folded_and_no_save_writes_a_second_f
 def test_a_copy_is_kept_and_the_repository_is_not_written_to(
     working_copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    # A reader's file must survive a second `make lab`.
     note = working_copy / "book" / "mine.txt"
     note.write_text("mine")
     assert lab.main([str(working_copy), "--no-open"]) == 0
@@ -129,6 +137,7 @@ def test_a_copy_is_kept_and_the_repository_is_not_written_to(
     full = tmp_path / "full"
     full.mkdir()
     (full / "thing").touch()
+    # The repository, a folder around it, and one with other files are refused.
     for folder in (ROOT, ROOT.parent, BOOK, BOOK / "new", full):
         with pytest.raises(SystemExit):
             lab.main([str(folder), "--no-open"])
@@ -141,6 +150,7 @@ def wait(ask: Any, seconds: int = 240) -> Any:
             answer = ask()
             if answer:
                 return answer
+        # The server does not listen yet.
         except OSError:
             pass
         time.sleep(1)
@@ -153,13 +163,16 @@ def test_in_jupyterlab_a_chapter_runs_and_is_saved_apart(tmp_path: Path) -> None
     stem = "01-bayes-and-kalman"
     lab.main([str(folder), "--no-open"])
     saved = folder / "book" / f"{stem}.ipynb"
+    # Outputs that are there later come from this run.
     _clear_outputs(saved)
     with socket.socket() as free:
+        # Port 0 lets the system choose a free one.
         free.bind(("127.0.0.1", 0))
         address = f"http://127.0.0.1:{free.getsockname()[1]}"
     command = [sys.executable, "-m", "jupyterlab", f"--notebook-dir={folder / 'book'}"]
     command += ["--no-browser", "--allow-root", f"--port={address.rsplit(':')[-1]}"]
     command += ["--IdentityProvider.token=", "--expose-app-in-browser"]
+    # The state of the repository before and after must be the same.
     before = subprocess.run(
         ["git", "status", "--short"], cwd=ROOT, capture_output=True
     ).stdout
@@ -180,6 +193,7 @@ def test_in_jupyterlab_a_chapter_runs_and_is_saved_apart(tmp_path: Path) -> None
     cells = [
         c for c in nbformat.read(saved, as_version=4).cells if c.cell_type == "code"
     ]
+    # All cells ran, once and in order, and the notebook was saved.
     assert [c.execution_count for c in cells] == list(range(1, len(cells) + 1))
     assert not [o for c in cells for o in c.outputs if o.output_type == "error"]
 

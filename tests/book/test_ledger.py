@@ -33,9 +33,11 @@ def test_ledger_has_every_item_once() -> None:
     items = [(row["paper"], row["item"]) for row in read_rows(ITEMS)]
     rows = read_rows(LEDGER)
     assert [(row["paper"], row["item"]) for row in rows] == items
+    # The papers have 21 tables and figures; an item twice would count twice.
     assert len(set(items)) == 21
     for row in rows:
         assert row["verdict"] in VERDICTS[row["kind"]]
+        # A result without a claim could not be checked.
         assert row["kind"] == "parameters" or claims_of(row)
         assert not powerless_claims(
             row
@@ -48,6 +50,7 @@ def test_a_verdict_fills_its_row() -> None:
     (row,) = ledger([ITEM], [])
     assert row["verdict"] == "not yet" and row["chapter"] == ITEM["chapter"]
     (row,) = ledger([ITEM], [VERDICT])
+    # Cells that the verdict does not give stay empty.
     other_cells = {"kind": "results", "null": "", "range": ""}
     assert row == VERDICT | other_cells and tuple(row) == COLUMNS
     assert text_of([row]).splitlines()[1].endswith('"a, b"')
@@ -70,6 +73,7 @@ def test_ledger_rejects(verdicts: list[dict[str, str]]) -> None:
 
 
 def test_tables_that_are_read_are_not_counted_as_matches() -> None:
+    # Reading a table of parameters reproduces nothing: it must not add to the matches.
     read = {**VERDICT, "item": "Table I", "verdict": "read"}
     counts = summaries(ledger([ITEM, TABLE], [VERDICT, read]))
     assert counts["parameters"] == (

@@ -51,16 +51,19 @@ def pretend(folder: Path, stamp: str | None) -> None:
 def makes_environment(folder: Path) -> bool:
     result = make(folder, "-n", "environment")
     assert result.returncode == 0, result.stderr
+    # With -n make prints the command if it would run it.
     return "environment.py" in result.stdout
 
 
 def test_only_a_whole_environment_is_kept(clone: Path) -> None:
     """No environment, an incomplete and a complete one, a newer lock, a missing Python."""
     assert makes_environment(clone)
+    # Without a stamp the last make was interrupted.
     pretend(clone, None)
     assert makes_environment(clone)
     stamp = clone / ".venv" / "stamp"
     python = clone / ".venv" / "bin" / "python"
+    # A stamp that names this folder, written last
     stamp.write_text(f"{clone}\n")
     assert not makes_environment(clone)
     # A stamp older than the lock: the packages have to be installed again.
@@ -69,6 +72,7 @@ def test_only_a_whole_environment_is_kept(clone: Path) -> None:
     os.utime(stamp)
     assert not makes_environment(clone)
     python.unlink()
+    # The system's Python was removed, for example by an update.
     python.symlink_to("/nowhere/python")
     assert makes_environment(clone)
 
@@ -85,6 +89,7 @@ def test_a_moved_or_copied_folder_makes_its_own(clone: Path, tmp_path: Path) -> 
 def test_an_old_python_or_none_is_named_and_leaves_nothing(
     clone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # A refusal must leave no half environment behind.
     before = sorted(clone.rglob("*"))
     result = make(clone, "environment", "PYTHON=")
     assert (
@@ -110,6 +115,7 @@ def steps(clone: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
             sys.exit(1)
 
     monkeypatch.chdir(clone)
+    # No package is installed in a test.
     monkeypatch.setattr(environment, "run", run)
     monkeypatch.setattr(sys, "argv", ["environment.py", ".venv"])
     return commands
@@ -119,11 +125,13 @@ def test_the_stamp_comes_last_and_names_the_folder(
     clone: Path, steps: list[str]
 ) -> None:
     environment.main()
+    # The list of packages, the library and the kit: three calls of pip
     assert steps[0] == "venv" and steps.count("pip") == 3
     assert (
         clone / ".venv" / "stamp"
     ).read_text() == f"{clone}\n" and not makes_environment(clone)
     steps.clear()
+    # A complete environment is updated in place: files in it stay.
     (clone / ".venv" / "kept").touch()
     environment.main()
     assert "venv" not in steps and (clone / ".venv" / "kept").exists()
@@ -131,6 +139,7 @@ def test_the_stamp_comes_last_and_names_the_folder(
 
 def test_an_interrupted_update_leaves_no_stamp(clone: Path, steps: list[str]) -> None:
     environment.main()
+    # The update breaks at its first command, after the stamp was removed.
     steps[:] = ["fail"]
     with pytest.raises(SystemExit):
         environment.main()
@@ -138,11 +147,14 @@ def test_an_interrupted_update_leaves_no_stamp(clone: Path, steps: list[str]) ->
     steps.clear()
     (clone / ".venv" / "half").touch()
     environment.main()
+    # Without a stamp everything is made again, and the half environment is gone.
     assert steps[0] == "venv" and not (clone / ".venv" / "half").exists()
 
 
 def test_line_ends_are_fixed_whatever_a_clone_s_settings_are() -> None:
     names = ["a.csv", "a.ipynb", "a.md", "a.py"]
+    # git would change line ends by the user's settings, and with them the compared
+    # bytes.
     attributes = subprocess.run(
         ["git", "check-attr", "eol", *names],
         cwd=ROOT,
@@ -154,6 +166,7 @@ def test_line_ends_are_fixed_whatever_a_clone_s_settings_are() -> None:
 
 
 def test_every_page_with_code_is_compared() -> None:
+    # `make test` names the chapters in parts; together they must be all.
     compared = re.findall(r"regress\.py (\S+)", make(ROOT, "-n", "test").stdout)
     assert sorted(chosen(compared)) == sorted(chapters())
 

@@ -41,6 +41,7 @@ def test_page_of_the_contents_is_built(name: str) -> None:
 
 @pytest.mark.parametrize("source", chapters(), ids=lambda source: source.stem)
 def test_a_chapter_with_its_pictures_is_small(source: Path) -> None:
+    # A browser loads the page and the pictures that it names.
     text = page(f"book/{source.stem}")
     pictures = set(re.findall(r"_images/[\w.-]+\.(?:png|webp|svg)", text))
     assert (
@@ -50,6 +51,7 @@ def test_a_chapter_with_its_pictures_is_small(source: Path) -> None:
 
 def test_chapters_import_nothing_from_their_folder() -> None:
     """So a chapter runs from any folder; scripts come by `studies.script`."""
+    # A notebook finds modules beside it only if it runs in the book's folder.
     local_names = {path.stem for path in (ROOT / "book").iterdir()}
     for source in chapters():
         text = source.read_text(encoding="utf-8")
@@ -63,9 +65,11 @@ def test_chapters_import_nothing_from_their_folder() -> None:
 
 def test_api_pages_are_small_and_document_every_public_name_once() -> None:
     texts = [page(f"book/api/{part}") for part in api_parts()]
+    # One page for each part, small enough to load on a phone
     assert max(map(len, texts)) <= 400_000
     text = "".join(texts)
     assert "TypeAliasForwardRef" not in text and " at 0x" not in text
+    # A name with two entries would have two addresses.
     anchors = re.findall(r'<dt[^>]* id="(distfilt[^"]*)"', text)
     assert len(anchors) == len(set(anchors))
     public = set(homes().values()) - {*modules(), "distfilt.__version__"}
@@ -83,6 +87,7 @@ def test_api_page_is_an_index_and_chapters_and_names_lead_to_each_other() -> Non
     text = page("book/api")
     index = text[text.index("<tbody") : text.index("</tbody>")]
     rows = re.findall(r"<tr.*?</tr>", index, flags=re.DOTALL)
+    # One row for each part, the most needed ones first
     assert len(rows) == len(api_parts()) <= 24
     assert "filters" in plain(rows[0]) and "updates" in plain(rows[1])
     for part, row in zip(api_parts(), rows, strict=True):
@@ -94,6 +99,7 @@ def test_page_of_reproductions_shows_the_ledger() -> None:
     text = page("book/reproductions")
     rows = read_rows(LEDGER)
     tables = re.findall(r"<tbody>(.*?)</tbody>", text, flags=re.DOTALL)
+    # Rows of all tables, in the ledger's order
     lines = [
         row
         for table in tables
@@ -102,12 +108,14 @@ def test_page_of_reproductions_shows_the_ledger() -> None:
     assert len(lines) == len(rows) == 21
     for row, line in zip(rows, lines, strict=True):
         assert row["item"] in plain(line) and row["verdict"] in plain(line)
+    # The sentence above the tables must give the same counts.
     for total, counts in summaries(rows).values():
         counted = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
         assert f"Of {total} " in plain(text) and counted in plain(text)
 
 
 def test_build_stops_at_a_missing_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A table of contents with a page that has no file
     monkeypatch.setattr(common, "toc_pages", lambda: ["book/nowhere"])
     monkeypatch.setattr(
         TocTreeCollector, "assign_figure_numbers", None

@@ -44,6 +44,7 @@ def words_of(code: str) -> set[str]:
 def with_imports(name: str) -> set[str]:
     """Return a source and the scripts that it imports, directly or through others."""
     names = {name}
+    # Studies share scripts, so a parameter may be read in one of these.
     for imported in re.findall(r"^(?:from|import) (\w+)", sources()[name], re.M):
         if imported in sources():
             names |= with_imports(imported)
@@ -56,6 +57,7 @@ def mentioned_with(paper: str, name: str) -> set[str]:
     mentioned: set[str] = set()
     for source in sources():
         reachable = [words[script] for script in with_imports(source)]
+        # The source names paper and scenario, itself or by an import.
         if any({paper, name} <= script_words for script_words in reachable):
             mentioned |= words[source]
     return mentioned
@@ -77,6 +79,7 @@ def test_every_parameter_is_read(paper: str, name: str) -> None:
     if "adjacency" in mentioned:
         mentioned.add("neighbours")
     unread = sorted(readable_names(paper, name) - mentioned)
+    # A parameter that nothing reads would suggest an influence that it does not have.
     assert not unread, f"{paper}/{name}: move to the notes: {', '.join(unread)}"
 
 
@@ -87,6 +90,7 @@ def test_a_change_has_to_be_accepted(
     assert tool.main([], tmp_path) == 0
     path = tmp_path / "data" / "scenarios" / "grange" / "table-2.toml"
     text = path.read_text(encoding="utf-8")
+    # Another value is a difference until it is accepted.
     path.write_text(text.replace("value = 200\n", "value = 50\n"), encoding="utf-8")
     assert tool.main([], tmp_path) == 1
     assert "make update-scenarios" in capsys.readouterr().err

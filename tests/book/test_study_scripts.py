@@ -37,6 +37,7 @@ def folder(tmp_path: Path) -> Path:
 def test_make_studies_stores_and_checks(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    # Without a script there is nothing to run, which is no error.
     assert tool.main([], tmp_path) == 0
     assert "no script" in capsys.readouterr().out
     script = folder / "spread.py"
@@ -51,6 +52,7 @@ def test_make_studies_stores_and_checks(
     assert tool.main(["spread", "--check", "--workers", "1"], tmp_path) == 0
     assert tool.main(["sprawl"], tmp_path) == 1
     capsys.readouterr()
+    # Other numbers, other parameters, and a study that lost its script
     for old, new, word in [
         ("size=para", "loc=1e-12, size=para", "another run"),
         ('"members": 20', '"rule": "mean", "members": 20', "other parameters"),
@@ -70,6 +72,7 @@ def test_a_script_s_name_and_columns_are_checked_before_it_runs(folder: Path) ->
     ]:
         (folder / "a.py").write_text(SCRIPT.replace(old, new, 1), encoding="utf-8")
         os.utime(folder / "a.py", (0, hash(word) % 2**30))
+        # The fault is found while the script loads, before a trial runs.
         with pytest.raises(ValueError, match=word):
             tool.main([], folder.parents[1])
 
@@ -97,15 +100,18 @@ def test_scripts_share_a_module_and_store_what_their_scenario_was(
 ) -> None:
     (folder / "_common.py").write_text(SHARED, encoding="utf-8")
     (folder / "two.py").write_text(USES, encoding="utf-8")
+    # Loading a script adds its folder to the path; this undoes it.
     monkeypatch.setattr(sys, "path", [*sys.path])
     assert tool.main(["--workers", "1"], tmp_path) == 0
     order = list(sys.modules)  # a ufunc is sent by the name of the first that has it
     assert order.index("_common") < order.index("stored_study_two")
     stored = studies.load(tmp_path / "data" / "studies" / "grange" / "table-2.csv")
     assert stored.metric("a").tolist() == [0.0, 1.0, 2.0, 3.0]
+    # The digest shows later whether the scenario was the same.
     digest = scenario("grange", "table-2").digest
     assert stored.parameters == {"gain": 1, "scenario_table_2": digest}
     assert tool.main(["--check", "--workers", "1"], tmp_path) == 0
+    # The same script with a changed scenario must neither run nor compare.
     text = USES.replace('"table-2")]', '"table-2").replace(gain=0.2)]')
     (folder / "two.py").write_text(text, encoding="utf-8")
     os.utime(folder / "two.py", (5, 5))

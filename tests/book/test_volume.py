@@ -22,6 +22,7 @@ def test_the_whole_book_is_written(kind: str, monkeypatch: pytest.MonkeyPatch) -
     assert volume.main() == 0
     target = volume.TARGET / f"{volume.NAME}.{kind}"
     if kind == "epub":
+        # In the EPUB a file, in the PDF a named place for each page of the book
         parts = {Path(name).stem for name in zipfile.ZipFile(target).namelist()}
     else:
         parts = set(volume.pages_of(target.read_bytes()))
@@ -31,6 +32,7 @@ def test_the_whole_book_is_written(kind: str, monkeypatch: pytest.MonkeyPatch) -
 
 def test_elements_that_do_not_fit_the_paper_are_rejected(tmp_path: Path) -> None:
     page = tmp_path / "bad.html"
+    # A line of code, a block, a picture and a formula with one fault each
     page.write_text(BAD.format("x" * 300), encoding="utf-8")
     with chromium(tmp_path / "profile") as driver, pytest.raises(SystemExit) as error:
         volume.open_page(driver, page)

@@ -28,12 +28,15 @@ def _case(seed: int, n: int = 24, m: int = 24, d: int = 3) -> tuple[np.ndarray, 
     columns = rng.random(m)
     rows[: n // 6] = 0.0
     columns[-1] = 0.0
-    return squared_distances(x, y), rows / rows.sum(), columns / columns.sum()
+    cost = squared_distances(x, y)
+    return cost, rows / rows.sum(), columns / columns.sum()
 
 
 def _assert_marginals(plan: TransportPlan, a: np.ndarray, b: np.ndarray) -> None:
-    assert np.abs(plan.matrix.sum(axis=1) - a).max() <= 1e-14
-    assert np.abs(plan.matrix.sum(axis=0) - b).max() <= 1e-14
+    row_error = plan.matrix.sum(axis=1) - a
+    column_error = plan.matrix.sum(axis=0) - b
+    assert np.abs(row_error).max() <= 1e-14
+    assert np.abs(column_error).max() <= 1e-14
     assert plan.matrix.min() >= 0
 
 
@@ -43,14 +46,19 @@ def test_the_network_simplex_is_certified_by_its_dual(
 ) -> None:
     """Feasible potentials bound the cost from below; without a duality gap both are optimal."""
     rng = np.random.default_rng(seed)
-    cost = squared_distances(rng.standard_normal((n, 2)), rng.standard_normal((m, 2)))
+    x = rng.standard_normal((n, 2))
+    y = rng.standard_normal((m, 2))
+    cost = squared_distances(x, y)
     a = rng.dirichlet(np.full(n, 0.3))
     b = rng.dirichlet(np.ones(m))
     plan = transport_plan(cost, a, b)
     f, g = plan.potentials
+    # f_i + g_j <= c_ij
     assert (f[:, None] + g <= cost + 1e-9).all()
-    assert abs(plan.bound - (f @ a + g @ b)) < 1e-12
-    assert abs(plan.value - (plan.matrix * cost).sum()) < 1e-12
+    dual_value = f @ a + g @ b
+    primal_value = (plan.matrix * cost).sum()
+    assert abs(plan.bound - dual_value) < 1e-12
+    assert abs(plan.value - primal_value) < 1e-12
     assert -1e-12 < plan.duality_gap < 1e-9
     _assert_marginals(plan, a, b)
 
@@ -64,16 +72,21 @@ def test_the_monotone_plan_is_the_cheapest(seed: int, n: int, m: int) -> None:
     a = rng.dirichlet(np.full(n, 0.5))
     b = rng.dirichlet(np.ones(m))
     plan = monotone_plan(x, y, a, b)
-    optimal = transport_plan(squared_distances(x[:, None], y[:, None]), a, b)
+    cost = squared_distances(x[:, None], y[:, None])
+    optimal = transport_plan(cost, a, b)
     assert abs(plan.value - optimal.value) < 1e-11
     assert -1e-12 < plan.duality_gap < 1e-11
     _assert_marginals(plan, a, b)
+    # A vertex of the transport polytope has at most n + m - 1 positive entries.
     assert (plan.matrix > 0).sum() <= n + m - 1
 
 
 def test_the_monotone_plan_with_ties_and_empty_masses() -> None:
     """A sixth of the mass has to move by one; a row without mass is empty."""
-    plan = monotone_plan([1.0, 1.0, 0.0, 5.0], [1.0, 1.0, 0.0], [0.25, 0.25, 0.5, 0.0])
+    x = [1.0, 1.0, 0.0, 5.0]
+    weights = [0.25, 0.25, 0.5, 0.0]
+    plan = monotone_plan(x, [1.0, 1.0, 0.0], weights)
+    # The mass at zero is 1/2 before and 1/3 after.
     assert abs(plan.value - 1 / 6) < 1e-15
     assert plan.matrix[3].sum() == 0
 
@@ -86,7 +99,9 @@ def test_scale_and_offset_of_the_cost_do_not_matter(scale: float) -> None:
     scaled_cost = np.asfortranarray(scale * cost + 7 * scale)
     scaled = transport_plan(scaled_cost, a, b)
     assert np.abs(scaled.matrix - reference.matrix).max() < 1e-9
-    assert abs(scaled.value / scale - 7 - reference.value) < 1e-9
+    # c' = s (c + 7), for a plan of total mass one: value' = s (value + 7).
+    unscaled_value = scaled.value / scale - 7
+    assert abs(unscaled_value - reference.value) < 1e-9
     # The potential of a column without mass is feasible too.
     assert b.min() == 0
     assert abs(reference.duality_gap) < 1e-12
@@ -110,6 +125,7 @@ def test_tiny_masses_do_not_make_a_problem_infeasible() -> None:
     weights = np.exp(-40 * x[:, 0] ** 2)
     weights /= weights.sum()
     plan = transport_plan(squared_distances(x), weights)
+    # Default masses of the columns are equal.
     _assert_marginals(plan, weights, np.full(60, 1 / 60))
     assert plan.duality_gap < 1e-6
 
@@ -163,10 +179,12 @@ def test_the_entropic_plan_satisfies_its_optimality_conditions(
     assert -1e-9 < excess < weight * np.log(n * m)
     # On all but negligible entries the logarithm is a sum of potentials.
     i, j = (plan.matrix > 1e-6).nonzero()
-    logs = np.log(plan.matrix[i, j]) + cost[i, j] / weight
+    scaled_costs = cost[i, j] / weight
+    logs = np.log(plan.matrix[i, j]) + scaled_costs
     design = np.zeros((i.size, n + m))
     entries = np.arange(i.size)
     design[entries, i] = 1.0
     design[entries, n + j] = 1.0
     potentials = np.linalg.lstsq(design, logs)[0]
-    assert np.abs(logs - design @ potentials).max() < 1e-3
+    residual = logs - design @ potentials
+    assert np.abs(residual).max() < 1e-3

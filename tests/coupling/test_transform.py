@@ -25,8 +25,11 @@ def _case(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return correlated members far from the origin, log-weights, and the weights."""
     rng = _rng(seed)
-    x = 5.0 + rng.standard_normal((n, d)) @ rng.standard_normal((d, d))
-    logs = -0.5 * ((x[:, 0] - 5.5) / 0.5) ** 2
+    normal = rng.standard_normal((n, d))
+    x = 5.0 + normal @ rng.standard_normal((d, d))
+    # The likelihood of an observation of the first component, 5.5 ± 0.5
+    deviation = (x[:, 0] - 5.5) / 0.5
+    logs = -0.5 * deviation**2
     weights = np.exp(logs - logs.max())
     return x, logs, weights / weights.sum()
 
@@ -48,11 +51,15 @@ def test_the_mean_is_the_weighted_mean(seed: int, n: int, d: int) -> None:
     x, logs, weights = _case(seed, n, d)
     scale = np.abs(x).max()
     transformed = coupling.transform_ensemble(x, logs)
-    assert np.abs(transformed.mean(axis=0) - weights @ x).max() <= 1e-14 * scale
+    mean_error = transformed.mean(axis=0) - weights @ x
+    assert np.abs(mean_error).max() <= 1e-14 * scale
     plan = coupling.transport_plans(x, logs)
-    assert np.abs(plan.sum(axis=1) - weights).max() <= 1e-14
-    assert np.abs(plan.sum(axis=0) - 1 / n).max() <= 1e-14
-    assert np.abs(transformed - n * plan.T @ x).max() <= 1e-13 * scale
+    row_error = plan.sum(axis=1) - weights
+    column_error = plan.sum(axis=0) - 1 / n
+    assert np.abs(row_error).max() <= 1e-14
+    assert np.abs(column_error).max() <= 1e-14
+    error = transformed - n * plan.T @ x
+    assert np.abs(error).max() <= 1e-13 * scale
 
 
 def test_copies_do_not_leave_the_choice_to_rounding() -> None:
@@ -62,7 +69,8 @@ def test_copies_do_not_leave_the_choice_to_rounding() -> None:
     x[20:25] = x[20]
     reference = coupling.transform_ensemble(x, logs)
     for seed in range(10):
-        perturbed = x * (1 + 1e-15 * _rng(seed).standard_normal(x.shape))
+        rounding = 1e-15 * _rng(seed).standard_normal(x.shape)
+        perturbed = x * (1 + rounding)
         transformed = coupling.transform_ensemble(perturbed, logs)
         assert np.abs(transformed - reference).max() < 1e-9
 
@@ -75,15 +83,20 @@ def test_weights_that_underflow_and_weights_of_zero() -> None:
     assert np.allclose(tiny, reference, atol=1e-9)
     single = np.full(40, -np.inf)
     single[7] = -1e4
-    assert np.abs(coupling.transform_ensemble(x, single) - x[7]).max() < 1e-13
+    copies = coupling.transform_ensemble(x, single)
+    assert np.abs(copies - x[7]).max() < 1e-13
 
 
 def test_ensembles_that_the_transform_does_not_change() -> None:
     """Equal weights, one member, and members that coincide."""
     x, _, _ = _case(4)
-    assert np.abs(coupling.transform_ensemble(x, np.zeros(40)) - x).max() < 1e-13
-    assert (coupling.transform_ensemble([[3.0, 4.0]], [-5.0]) == [[3.0, 4.0]]).all()
-    assert (coupling.transform_ensemble(np.ones((6, 2)), np.arange(6.0)) == 1).all()
+    # The cheapest plan between equal masses at equal places moves nothing.
+    with_equal_weights = coupling.transform_ensemble(x, np.zeros(40))
+    assert np.abs(with_equal_weights - x).max() < 1e-13
+    single = coupling.transform_ensemble([[3.0, 4.0]], [-5.0])
+    assert (single == [[3.0, 4.0]]).all()
+    coinciding = coupling.transform_ensemble(np.ones((6, 2)), np.arange(6.0))
+    assert (coinciding == 1).all()
 
 
 @pytest.mark.parametrize("correct", [False, True])
@@ -92,9 +105,10 @@ def test_leading_axes_are_separate_ensembles(correct: bool) -> None:
     cases = [_case(seed) for seed in range(4)]
     x = np.stack([case[0] for case in cases])
     logs = np.stack([case[1] for case in cases])
-    batch = coupling.transform_ensemble(
-        x.reshape(2, 2, 40, 3), logs.reshape(2, 2, 40), correct=correct
-    )
+    batch_x = x.reshape(2, 2, 40, 3)
+    batch_logs = logs.reshape(2, 2, 40)
+    batch = coupling.transform_ensemble(batch_x, batch_logs, correct=correct)
+    # Ensemble 2 is entry (1, 0) of the batch.
     single = coupling.transform_ensemble(x[2], logs[2], correct=correct)
     assert np.allclose(batch[1, 0], single, atol=1e-12)
 
@@ -114,9 +128,12 @@ def test_the_correction_gives_both_moments(seed: int, n: int, d: int) -> None:
     logs = np.log(weights)
     corrected = coupling.transform_ensemble(x, logs, correct=True)
     mean_error = np.abs(corrected.mean(axis=0) - weights @ x).max()
-    assert mean_error < 1e-12 * np.abs(x).max()
+    scale = np.abs(x).max()
+    assert mean_error < 1e-12 * scale
     p = _covariance(x, weights)
-    assert np.abs(_covariance(corrected) - p).max() < 1e-12 * np.abs(p).max()
+    covariance_error = np.abs(_covariance(corrected) - p).max()
+    assert covariance_error < 1e-12 * np.abs(p).max()
+    # Members are averages of the prior's: Jensen's inequality for the trace.
     transformed = coupling.transform_ensemble(x, logs)
     trace = np.trace(p)
     assert np.trace(_covariance(transformed)) <= trace + 1e-9 * trace
@@ -130,6 +147,7 @@ def test_the_correction_is_the_symmetric_map() -> None:
     before = transformed - transformed.mean(axis=0)
     after = corrected - corrected.mean(axis=0)
     matrix = np.linalg.lstsq(before, after, rcond=None)[0]
+    # One linear map moves all members exactly.
     assert np.abs(before @ matrix - after).max() < 1e-10
     assert np.abs(matrix - matrix.T).max() < 1e-9
     assert np.linalg.eigvalsh(matrix).min() > 0
@@ -150,9 +168,11 @@ def test_the_correction_in_any_units(std: list[float], offset: list[float]) -> N
     transformed = coupling.transform_ensemble(x, logs)
     corrected = coupling.correct_moments(transformed, x, logs)
     mean_error = np.abs(corrected.mean(axis=0) - weights @ x)
+    # The accuracy of a component is that of its own size, not of the largest one.
     assert (mean_error < 1e-12 * (np.abs(offset) + std)).all()
     error = _covariance(corrected) - _covariance(x, weights)
-    assert np.abs(error / np.outer(std, std)).max() < 1e-8
+    relative_error = error / np.outer(std, std)
+    assert np.abs(relative_error).max() < 1e-8
 
 
 def test_the_correction_does_not_stretch_rounding() -> None:
@@ -164,6 +184,7 @@ def test_the_correction_does_not_stretch_rounding() -> None:
         corrected = coupling.correct_moments(flat, x, logs)
         anomalies = corrected - corrected.mean(axis=0)
         sizes = np.linalg.svd(anomalies, compute_uv=False)
+        # Rank three: the fourth direction has only rounding, the third is real.
         assert sizes[3] < 1e-12 * sizes[0]
         assert sizes[2] > 1e-6 * sizes[0]
 
@@ -178,15 +199,17 @@ def test_entropy_shrinks_the_ensemble_and_debiasing_restores_it() -> None:
     exact = coupling.transform_ensemble(x, logs)
     biased = coupling.transform_ensemble(x, logs, **entropic)
     debiased = coupling.transform_ensemble(x, logs, debias=True, **entropic)
-    variance = {
-        name: np.trace(_covariance(ensemble))
-        for name, ensemble in (("b", biased), ("d", debiased), ("e", exact))
-    }
-    assert variance["b"] < 0.7 * variance["e"]
-    loss = variance["e"] - variance["b"]
-    assert abs(variance["d"] - variance["e"]) < 0.5 * loss
-    assert np.abs(debiased.mean(axis=0) - weights @ x).max() < 1e-13
-    expected = biased + x - coupling.transform_ensemble(x, np.zeros(60), **entropic)
+    exact_variance = np.trace(_covariance(exact))
+    biased_variance = np.trace(_covariance(biased))
+    debiased_variance = np.trace(_covariance(debiased))
+    assert biased_variance < 0.7 * exact_variance
+    loss = exact_variance - biased_variance
+    assert abs(debiased_variance - exact_variance) < 0.5 * loss
+    mean_error = debiased.mean(axis=0) - weights @ x
+    assert np.abs(mean_error).max() < 1e-13
+    # Without regularisation equal weights would move nothing: x - T(x) is the bias.
+    unweighted = coupling.transform_ensemble(x, np.zeros(60), **entropic)
+    expected = biased + x - unweighted
     expected += weights @ x - expected.mean(axis=0)
     assert np.allclose(debiased, expected)
 
@@ -205,12 +228,16 @@ def test_rejuvenation_keeps_the_mean_and_adds_covariance() -> None:
     copies = np.tile(x.mean(axis=0), (4000, 60, 1))
     forecast = np.tile(x, (4000, 1, 1))
     rejuvenated = coupling.rejuvenate(copies, forecast, bandwidth=0.2, rng=_rng(11))
-    assert np.abs(rejuvenated.mean(axis=1) - x.mean(axis=0)).max() < 1e-12
+    # The draws are centred in each ensemble.
+    mean_error = rejuvenated.mean(axis=1) - x.mean(axis=0)
+    assert np.abs(mean_error).max() < 1e-12
     noise = rejuvenated - copies
     covariance = np.einsum("rni,rnj->ij", noise, noise) / (4000 * 60)
     expected = 0.04 * np.cov(x.T)
-    assert np.abs(covariance - expected).max() < 0.01 * np.abs(expected).max()
-    assert (coupling.rejuvenate(x, x, bandwidth=0.0, rng=_rng()) == x).all()
+    error = np.abs(covariance - expected).max()
+    assert error < 0.01 * np.abs(expected).max()
+    unchanged = coupling.rejuvenate(x, x, bandwidth=0.0, rng=_rng())
+    assert (unchanged == x).all()
 
 
 # -------------------------------------------------------------------------------- pieces
@@ -219,17 +246,24 @@ def test_rejuvenation_keeps_the_mean_and_adds_covariance() -> None:
 def test_one_piece_is_the_transform_and_many_are_a_resampling() -> None:
     """With a piece for every member each new member is a copy."""
     x, logs, _ = _case(12)
-    one_piece = coupling.transform_within(x, logs, np.zeros(40, dtype=int), rng=_rng())
-    assert np.allclose(one_piece, coupling.transform_ensemble(x, logs), atol=1e-13)
+    labels = np.zeros(40, dtype=int)
+    one_piece = coupling.transform_within(x, logs, labels, rng=_rng())
+    transformed = coupling.transform_ensemble(x, logs)
+    assert np.allclose(one_piece, transformed, atol=1e-13)
     resampled = coupling.transform_within(x, logs, np.arange(40), rng=_rng())
     distance = np.abs(resampled[:, None] - x).sum(axis=-1)
-    assert distance.min(axis=1).max() < 1e-12
+    to_nearest = distance.min(axis=1)
+    assert to_nearest.max() < 1e-12
 
 
 def test_pieces_are_chosen_with_the_plan_s_probabilities() -> None:
     """Over 4000 draws each frequency lies within five standard errors of its probability."""
     probabilities = np.array(
-        [[0.2, 0.5, 1.0, 0.1], [0.3, 0.5, 0.0, 0.2], [0.5, 0.0, 0.0, 0.7]]
+        [
+            [0.2, 0.5, 1.0, 0.1],
+            [0.3, 0.5, 0.0, 0.2],
+            [0.5, 0.0, 0.0, 0.7],
+        ]
     )
     rng = _rng(13)
     choices = np.array([_choose_rows(probabilities, rng) for _ in range(4000)])
@@ -246,12 +280,16 @@ def test_pieces_are_chosen_with_the_plan_s_probabilities() -> None:
 def test_members_stay_in_their_pieces() -> None:
     """Of two intervals no average lies between them, unlike with the plain transform."""
     rng = _rng(14)
-    x = np.concatenate([rng.uniform(-2, -1, 25), rng.uniform(1, 2, 25)])[:, None]
+    negative = rng.uniform(-2, -1, 25)
+    positive = rng.uniform(1, 2, 25)
+    x = np.concatenate([negative, positive])[:, None]
     is_positive = x[:, 0] > 0
     logs = np.where(is_positive, 0.7, 0.0) + 0.3 * x[:, 0]
-    within = coupling.transform_within(x, logs, is_positive.astype(int), rng=rng)
+    pieces = is_positive.astype(int)
+    within = coupling.transform_within(x, logs, pieces, rng=rng)
     assert (np.abs(within) >= 1).all()
-    assert (np.abs(coupling.transform_ensemble(x, logs)) < 1).any()
+    across = coupling.transform_ensemble(x, logs)
+    assert (np.abs(across) < 1).any()
 
 
 # --------------------------------------------------------------------------- curved sets
@@ -263,9 +301,8 @@ def test_along_a_flat_set_it_is_the_transform() -> None:
     options: dict[str, Any] = {"difference": np.subtract, "retract": np.add}
     flat = coupling.transform_along(x, logs, **options)
     assert np.allclose(flat, coupling.transform_ensemble(x, logs), atol=1e-12)
-    batch = coupling.transform_along(
-        np.stack([x, 2 * x]), np.stack([logs, logs]), **options
-    )
+    ensembles = np.stack([x, 2 * x])
+    batch = coupling.transform_along(ensembles, np.stack([logs, logs]), **options)
     assert np.allclose(batch, [flat, 2 * flat], atol=1e-12)
 
 
@@ -282,6 +319,7 @@ def test_a_rotation_of_all_angles_rotates_the_result() -> None:
     reference = coupling.transform_along(angles, logs, **options)
     rotated_angles = _wrap_difference(angles + 3.0, zero)
     rotated = coupling.transform_along(rotated_angles, logs, **options)
-    assert np.abs(_wrap_difference(rotated - 3.0, reference)).max() < 1e-12
+    error = _wrap_difference(rotated - 3.0, reference)
+    assert np.abs(error).max() < 1e-12
     # Some angles are indeed beside the cut.
     assert np.abs(rotated).max() > 3.0

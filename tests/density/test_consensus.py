@@ -25,11 +25,14 @@ def test_the_noise_is_the_constant_times_a_density_bounded_below() -> None:
     p = np.random.default_rng(3).random((3, 100))
     agents = np.array([4.0, 9.0, 0.5, 1.0, 1.0, 7.0])
     noise = snapshot.noise_strength(p, agents, 0.3)
+    # The variance of a mean of n kernels is k̄ p / n.
     constant = density.kernel_constant(GRID, bandwidth=H, agents=1)
     # Agent 0 averages four kernels, and agent 2 one.
-    assert np.allclose(noise[0], constant / 4 * p[0].clip(0.3), rtol=1e-14)
+    expected = constant / 4 * p[0].clip(0.3)
+    assert np.allclose(noise[0], expected, rtol=1e-14)
     assert np.isinf(noise[1]).all()
-    assert np.allclose(noise[2], constant * p[2].clip(0.3), rtol=1e-14)
+    expected = constant * p[2].clip(0.3)
+    assert np.allclose(noise[2], expected, rtol=1e-14)
 
 
 def _snapshots() -> tuple[SwarmSnapshot, SwarmSnapshot]:
@@ -46,7 +49,8 @@ def test_dynamic_average_consensus_mixes_and_adds_the_change_of_the_inputs() -> 
     memory = rule.initial_state(first)
     _, y, _ = rule.update(memory, second, Channel(graph), 0.1)
     w = weights.metropolis(graph).matrix.toarray()
-    expected = w @ first.kernels + second.kernels - first.kernels
+    mixed = w @ first.kernels
+    expected = mixed + second.kernels - first.kernels
     assert np.abs(y - expected).max() < 1e-12
     # Doubly stochastic weights conserve the mean.
     swarm = density.kernel_density(X[1], GRID, bandwidth=H)
@@ -60,14 +64,16 @@ def test_the_rate_of_the_inputs_removes_the_lag_of_pi_consensus(rate: bool) -> N
     rule = density.PIConsensus(alpha=0.5, a=1e-12, b=0.0, rate=rate)
     memory = rule.initial_state(first)
     _, y, _ = rule.update(memory, second, Channel(graphs.path(6)), 0.1)
+    # Without coupling an estimate only follows its own input.
     expected = second if rate else first
     assert np.abs(y - expected.kernels).max() < 1e-9
 
 
 def test_absent_agents_do_not_count_in_the_noise() -> None:
     """Two of six agents that know each other disappear: the data of the others are of four."""
+    model = density.FokkerPlanck(rotating_swarm(), GRID)
     f = DensityFilter(
-        density.FokkerPlanck(rotating_swarm(), GRID),
+        model,
         6,
         graphs.complete(6),
         fusion=density.Flooding(forget=0.05),
@@ -86,7 +92,8 @@ def test_absent_agents_do_not_count_in_the_noise() -> None:
     # M = I + Δ Sᵀ R⁻¹ S with R of four agents, and M = I for absent ones
     constant = density.kernel_constant(GRID, bandwidth=H, agents=4)
     R = constant * np.maximum(forecast, 0.1)
-    expected = np.eye(20) + 0.1 * (S.T / R) @ S
+    measured = (S.T / R) @ S
+    expected = np.eye(20) + 0.1 * measured
     information = state.filters.information
     assert np.allclose(information[:4], expected, rtol=1e-10)
     assert np.array_equal(information[4], np.eye(20))
@@ -103,6 +110,7 @@ PROTOCOLS = [
 def _run_in_unit(protocol: object, unit: float) -> tuple[np.ndarray, ...]:
     """Estimates, variances and masses after four steps in a box of this width, without units."""
     swarm = rotating_swarm("gibbs")
+    # x = s x': velocities have the unit s / s, diffusions s² / s.
     scaled = Swarm(
         lambda x, t: unit * swarm.drift_at(x / unit, t),
         unit**2 * 0.03,
@@ -110,6 +118,7 @@ def _run_in_unit(protocol: object, unit: float) -> tuple[np.ndarray, ...]:
         high=[unit, unit],
     )
     grid = density.Grid((10, 10), high=[unit, unit])
+    # The radius of communication and the bandwidth are lengths.
     f = DensityFilter(
         density.FokkerPlanck(scaled, grid),
         6,
@@ -121,7 +130,8 @@ def _run_in_unit(protocol: object, unit: float) -> tuple[np.ndarray, ...]:
     )
     state = f.start(unit * X[0])
     for k in range(4):
-        state = f.step(state, 0.1 * (k + 1), unit * X[k % 2])
+        positions = unit * X[k % 2]
+        state = f.step(state, 0.1 * (k + 1), positions)
     mass = f.summarize(state).numbers["mass"]
     # A density is an inverse area.
     return unit**2 * state.estimates, unit**4 * state.variances, mass

@@ -12,15 +12,19 @@ BOX = Grid((4, 6), low=[-1.0, 2.0], high=[1.0, 5.0])
 
 def test_the_last_axis_is_fastest_and_walls_belong_to_their_cells() -> None:
     # Next cell, and next row of cells
-    assert np.allclose(BOX.centres[1] - BOX.centres[0], [0.0, 0.5])
-    assert np.allclose(BOX.centres[6] - BOX.centres[0], [0.5, 0.0])
+    to_next_cell = BOX.centres[1] - BOX.centres[0]
+    to_next_row = BOX.centres[6] - BOX.centres[0]
+    assert np.allclose(to_next_cell, [0.0, 0.5])
+    assert np.allclose(to_next_row, [0.5, 0.0])
     assert np.array_equal(BOX.cell_index(BOX.centres), np.arange(24))
     # The corners
-    assert np.array_equal(BOX.cell_index([[1.0, 5.0], [-1.0, 2.0]]), [23, 0])
+    corners = [[1.0, 5.0], [-1.0, 2.0]]
+    assert np.array_equal(BOX.cell_index(corners), [23, 0])
 
 
 def test_a_histogram_counts_each_batch() -> None:
-    x = np.random.default_rng(1).random((3, 50, 2)) * [2, 3] + [-1, 2]
+    uniform = np.random.default_rng(1).random((3, 50, 2))
+    x = uniform * [2, 3] + [-1, 2]
     histogram = BOX.histogram(x)
     assert histogram.shape == (3, 24)
     # numpy's histogram of one batch
@@ -32,9 +36,11 @@ def test_a_histogram_counts_each_batch() -> None:
 
 def test_integral_and_norm_are_sums_times_the_cell_volume() -> None:
     """The box has a volume of 6 and 24 cells; a histogram has the integral 1."""
-    x = np.random.default_rng(1).random((3, 50, 2)) * [2, 3] + [-1, 2]
+    uniform = np.random.default_rng(1).random((3, 50, 2))
+    x = uniform * [2, 3] + [-1, 2]
     histogram = BOX.histogram(x)
     assert np.allclose(BOX.integral(histogram), 1, atol=1e-14)
+    # ‖p‖² = ∫ p²
     square = (histogram**2).sum(axis=-1) * 6 / 24
     assert np.allclose(BOX.norm(histogram) ** 2, square, atol=1e-14)
 
@@ -45,6 +51,7 @@ def test_integral_and_norm_are_sums_times_the_cell_volume() -> None:
 def test_cosines_are_orthonormal_and_complete(grid: Grid) -> None:
     """As many modes as cells; all but the constant one have no mass."""
     modes = grid.cosines(grid.size)
+    # ∫ φ_j φ_k = δ_jk by the midpoint rule, which is exact for cosines.
     gram = modes.T @ modes * grid.volume
     assert np.abs(gram - np.eye(grid.size)).max() < 1e-12
     assert np.abs(modes[:, 1:].sum(axis=0)).max() < 1e-11
@@ -71,15 +78,18 @@ def test_the_lowest_modes_are_the_same_in_every_unit(
     expected = Grid(shape, high=sides)
     grid = Grid(shape, high=unit * np.array(sides))
     size = grid.size
-    assert np.array_equal(grid.wavenumbers(size), expected.wavenumbers(size))
+    wavenumbers = grid.wavenumbers(size)
+    assert np.array_equal(wavenumbers, expected.wavenumbers(size))
 
 
 @pytest.mark.parametrize("shape", [(9,), (4, 5, 6)])
 def test_interpolation_is_exact_for_products_of_lines(shape: tuple[int, ...]) -> None:
     """Away from walls; at a wall it is constant."""
     grid = Grid(shape)
+    # Multilinear interpolation reproduces Π (1 + x_i).
     values = (1 + grid.centres).prod(axis=-1)
-    x = 0.2 + 0.6 * np.random.default_rng(2).random((20, grid.dim))
+    uniform = np.random.default_rng(2).random((20, grid.dim))
+    x = 0.2 + 0.6 * uniform
     exact = (1 + x).prod(axis=-1)
     assert np.allclose(grid.interpolate(values, x), exact, atol=1e-13)
     corner = grid.interpolate(values, np.zeros(grid.dim))
@@ -90,11 +100,13 @@ def test_a_prior_has_its_variance_its_length_and_no_mass() -> None:
     grid = Grid((20, 20), high=[2.0, 1.0])
     factor = zero_mean_prior(grid, rank=399, length=0.2, std=0.7)
     # The variance is 0.7² in the mean over the cells.
-    assert (factor**2).sum() / grid.size == pytest.approx(0.49, rel=1e-10)
+    mean_variance = (factor**2).sum() / grid.size
+    assert mean_variance == pytest.approx(0.49, rel=1e-10)
     assert np.abs(factor.sum(axis=0)).max() < 1e-10
     # Two cells of 0.1 along axis 0 are one correlation length apart.
     cov = factor @ factor.T
     correlation = cov[190, 230] / cov[190, 190]
+    # exp(-r²/(2 ℓ²)) at r = ℓ, but for the walls
     assert correlation == pytest.approx(np.exp(-0.5), abs=0.1)
     # A lower rank truncates it.
     truncated = zero_mean_prior(grid, rank=50, length=0.2, std=0.7)
@@ -108,6 +120,7 @@ def test_an_uncertain_mass_is_a_constant_column() -> None:
     assert np.array_equal(factor[:, 1:], zero_mean_prior(grid, rank=30))
     mass = factor[:, 0]
     assert np.ptp(mass) == 0
+    # A standard deviation of the mass of 0.2
     assert grid.integral(mass) == pytest.approx(0.2, rel=1e-12)
 
 
@@ -128,4 +141,6 @@ def test_a_prior_far_longer_than_the_box_is_its_lowest_modes(
     """exp(-π²ℓ²|k|²/2) underflows for all modes, but only ratios matter."""
     grid = Grid((9, 9), high=[width, 1.0])
     factor = zero_mean_prior(grid, rank=5, length=1e12, std=0.5)
+    # In a square two modes share the lowest frequency and the variance 0.5², in a long
+    # box one is the lowest.
     assert np.allclose((factor**2).mean(axis=0), expected)

@@ -18,7 +18,8 @@ def test_reflection_conserves_the_mass(shape: tuple[int, ...], h: float) -> None
     """Of kernels that are narrow, and as wide as the box; no value is negative."""
     d = len(shape)
     grid = density.Grid(shape, low=[2.0] * d, high=[3.0] * d)
-    x = 2 + np.random.default_rng(2).random((30, d))
+    uniform = np.random.default_rng(2).random((30, d))
+    x = 2 + uniform
     z = density.kernels(x, grid, bandwidth=h)
     assert np.abs(grid.integral(z) - 1).max() < 1e-12
     assert z.min() >= 0
@@ -34,9 +35,12 @@ def test_reflection_solves_the_heat_equation() -> None:
     h = 0.2
     frequency = np.pi * np.arange(1, 60)[:, None]
     # Integrals of cos(π k s) over the cells
-    integrals = np.diff(np.sin(frequency * grid.edges[0]), axis=1) / frequency
-    decay = np.exp(-0.5 * (frequency * h) ** 2) * np.cos(frequency * x)
-    series = 1 + 2 * (decay * integrals).sum(axis=0) / grid.volume
+    antiderivative = np.sin(frequency * grid.edges[0]) / frequency
+    integrals = np.diff(antiderivative, axis=1)
+    # p(s) = 1 + 2 Σ exp(-½ (π k h)²) cos(π k x) cos(π k s), averaged over the cells
+    decay = np.exp(-0.5 * (frequency * h) ** 2)
+    terms = decay * np.cos(frequency * x) * integrals
+    series = 1 + 2 * terms.sum(axis=0) / grid.volume
     kernel = density.kernels([[x]], grid, bandwidth=h)[0]
     assert np.abs(kernel - series).max() < 1e-12
 
@@ -73,7 +77,8 @@ def test_the_constant_is_the_integral_of_the_squared_kernel(
     grid = density.Grid(shape)
     middle = np.full((1, grid.dim), 0.5)
     kernel = density.kernels(middle, grid, bandwidth=0.05)
-    expected = float(grid.norm(kernel)[0] ** 2) / 100
+    squared_integral = float(grid.norm(kernel)[0] ** 2)
+    expected = squared_integral / 100
     constant = density.kernel_constant(grid, bandwidth=0.05, agents=100)
     assert constant == pytest.approx(expected, rel=5e-3)
 
@@ -81,8 +86,10 @@ def test_the_constant_is_the_integral_of_the_squared_kernel(
 def test_covariance_is_that_of_one_agent_divided_by_their_number() -> None:
     """An agent is in cell j with probability p_j Δ, and its kernel is then that cell's."""
     grid = density.Grid((10, 10))
-    p = grid.normalize(1 + grid.centres[:, 0] + 2 * grid.centres[:, 1] ** 2)
+    x = grid.centres
+    p = grid.normalize(1 + x[:, 0] + 2 * x[:, 1] ** 2)
     z = density.kernels(grid.centres, grid, bandwidth=0.12)
+    # E z = Σ p_j Δ z_j, Cov z = Cov(z_j) / N for N independent agents
     mean, cov = density.kernel_covariance(p, grid, bandwidth=0.12, agents=20)
     assert np.allclose(mean, np.average(z, axis=0, weights=p))
     single = np.cov(z.T, aweights=p * grid.volume, ddof=0)
@@ -93,7 +100,8 @@ def test_silverman_s_rule_in_two_dimensions_and_in_one() -> None:
     """σ (4/((d + 2) N))^(1/(d + 4))"""
     x = np.random.default_rng(4).random((100, 2))
     std = np.sqrt(x.var(axis=0).mean())
-    assert density.bandwidth(x, GRID) == pytest.approx(std * 100 ** (-1 / 6))
+    expected = std * 100 ** (-1 / 6)
+    assert density.bandwidth(x, GRID) == pytest.approx(expected)
     x = np.random.default_rng(4).random((50, 1))
     expected = x.std() * (4 / 150) ** 0.2
     assert density.bandwidth(x, density.Grid((40,))) == pytest.approx(expected)
@@ -109,8 +117,10 @@ def test_the_score_of_cross_validation_leaves_each_agent_out(distance: float) ->
         others = np.delete(x, i, axis=0)
         estimate = density.kernel_density(others, GRID, bandwidth=0.04)
         values.append(estimate[GRID.cell_index(x[i])])
-    expected = (p**2).sum() * GRID.volume - 2 * np.mean(values)
-    assert _cross_validation_score(x, GRID, 0.04) == pytest.approx(expected)
+    square = (p**2).sum() * GRID.volume
+    expected = square - 2 * np.mean(values)
+    score = _cross_validation_score(x, GRID, 0.04)
+    assert score == pytest.approx(expected)
 
 
 def test_cross_validation_has_the_least_score() -> None:
@@ -121,7 +131,8 @@ def test_cross_validation_has_the_least_score() -> None:
     h = density.bandwidth(x, GRID, rule="least_squares")
     least = _cross_validation_score(x, GRID, h)
     for factor in (0.8, 1.25, 2.0):
-        assert least < _cross_validation_score(x, GRID, factor * h)
+        score = _cross_validation_score(x, GRID, factor * h)
+        assert least < score
     assert h < 0.7 * density.bandwidth(x, GRID)
 
 

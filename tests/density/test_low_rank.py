@@ -33,7 +33,8 @@ def test_two_steps_are_the_textbook_kalman_filter(filters: int) -> None:
     phi = RNG.random((n, n)) / 2
     q = RNG.standard_normal((n, 2))
     # Two columns of zeros leave room for the process noise: nothing is truncated.
-    root = np.hstack([RNG.standard_normal((n, n)), np.zeros((n, 2))])
+    square_root = RNG.standard_normal((n, n))
+    root = np.hstack([square_root, np.zeros((n, 2))])
     means = RNG.standard_normal((filters, n))
     r = RNG.random((filters, n)) + 0.5
     state = density.low_rank_start(root, means)
@@ -41,7 +42,8 @@ def test_two_steps_are_the_textbook_kalman_filter(filters: int) -> None:
     for y in RNG.standard_normal((2, filters, n)):
         # The textbook's filter: P⁻ = Φ P Φᵀ + Q Δ, K = P⁻ (P⁻ + R/Δ)⁻¹
         means = means @ phi.T
-        covs = phi @ covs @ phi.T + dt * q @ q.T
+        process_cov = dt * q @ q.T
+        covs = phi @ covs @ phi.T + process_cov
         noise = r[:, :, None] * np.eye(n) / dt
         gains = covs @ np.linalg.inv(covs + noise)
         means = means + np.einsum("fij,fj->fi", gains, y - means)
@@ -93,8 +95,10 @@ def test_low_rank_equals_dense_with_the_same_prior_and_both_conserve_the_mass(
     estimate = low.estimates[0]
     error = np.abs(estimate - dense.mean).max()
     assert error < 1e-10 * np.abs(dense.mean).max()
-    assert np.abs(low.covariance(0) - dense.covariance).max() < 1e-10
-    assert np.abs(low.variances[0] - np.diag(dense.covariance)).max() < 1e-10
+    covariance_error = low.covariance(0) - dense.covariance
+    assert np.abs(covariance_error).max() < 1e-10
+    variance_error = low.variances[0] - np.diag(dense.covariance)
+    assert np.abs(variance_error).max() < 1e-10
     # The prior's columns have no mass, so that no update changes it.
     masses = grid.integral(np.stack([dense.mean, estimate]))
     assert np.abs(masses - 1).max() < 1e-12
@@ -121,21 +125,27 @@ def test_filters_are_independent_and_an_infinite_noise_measures_nothing(
     start = density.low_rank_start(BASIS, base)
     forecast = density.low_rank_predict(start, transition, process=process, dt=0.1)
     analysis = density.low_rank_step(forecast, y, r, 0.1)
+    # R⁻¹ = 0: no innovation enters.
     assert np.array_equal(analysis.estimates[3], forecast.estimates[3])
     # The limit of a huge noise
     limit = density.low_rank_step(forecast, y, np.minimum(r, 1e15), 0.1)
-    assert np.abs(analysis.estimates - limit.estimates).max() < 1e-12
+    limit_error = analysis.estimates - limit.estimates
+    assert np.abs(limit_error).max() < 1e-12
     # Each filter by itself
     for i in (0, 4, 19):
         single = density.low_rank_start(BASIS, base[i : i + 1])
         single = _predict_and_step(single, transition, y[i], r[i], 0.1, process)
-        assert np.abs(single.estimates[0] - analysis.estimates[i]).max() < 1e-12
-        assert np.abs(single.variances[0] - analysis.variances[i]).max() < 1e-12
+        estimate_error = single.estimates[0] - analysis.estimates[i]
+        variance_error = single.variances[0] - analysis.variances[i]
+        assert np.abs(estimate_error).max() < 1e-12
+        assert np.abs(variance_error).max() < 1e-12
 
 
 def test_an_ill_conditioned_information_is_an_error() -> None:
     """A step of 1e20 s, in which some cells are measured and others are not."""
-    start = density.low_rank_start(np.eye(36)[:, :9], np.ones((1, 36)))
+    basis = np.eye(36)[:, :9]
+    start = density.low_rank_start(basis, np.ones((1, 36)))
+    # M = I + Δ Sᵀ R⁻¹ S has the eigenvalues 1 and 1 + 1e20.
     noise = np.where(np.arange(36) < 4, np.inf, 1.0)
     with pytest.raises(np.linalg.LinAlgError, match="density filter: .* out of scale"):
         density.low_rank_step(start, np.ones(36), noise, 1e20)

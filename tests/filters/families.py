@@ -1,6 +1,6 @@
-"""Every family of filters and every rule of agreement, for the tests that all of them have to pass.
+"""Every family of filters and every fusion rule, for the tests that all of them have to pass.
 
-A new family adds a line to FAMILIES and gets the contract's tests for nothing.
+A new family adds a line to FAMILIES, and the tests of the contract run for it too.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.random import default_rng
 
 from distfilt import network
 from distfilt.filters import (
@@ -19,7 +20,7 @@ from distfilt.filters import (
     TransportFilter,
 )
 from distfilt.kalman import kalman_filter
-from distfilt.models import LinearModel, simulate
+from distfilt.models import LinearModel, Model, simulate
 from distfilt.sensors import Sensor, component, stack
 from distfilt.updates import (
     enkf_exact,
@@ -68,23 +69,40 @@ RULES = {
 
 
 def rules(family: str) -> list[Callable[..., Any]]:
-    """Agreements that fit the family: of Gaussians, of log-likelihoods or of ensembles."""
+    """Fusion rules that fit the family: of Gaussians, of log-likelihoods or of ensembles."""
+    # "ensemble, common" has two of the words; the first one in this order counts.
     words = [word for word in ("gaussian", "common", "ensemble") if word in family]
-    return RULES[words[0] if words else "ensemble"]
+    # Particles are fused as ensembles.
+    kind = words[0] if words else "ensemble"
+    return RULES[kind]
 
 
+# Full matrices: a test with diagonal ones would miss a transpose or a lost correlation.
 Q = np.array([[0.3, 0.1], [0.1, 0.2]])
-PRIOR = (np.array([1.0, -0.5]), np.array([[1.0, 0.3], [0.3, 0.8]]))
+PRIOR_MEAN = np.array([1.0, -0.5])
+PRIOR_COV = np.array([[1.0, 0.3], [0.3, 0.8]])
+PRIOR = (PRIOR_MEAN, PRIOR_COV)
 NOISE = np.array([[0.5, 0.2], [0.2, 0.4]])
+
+
+def still_model(dim: int, rate: float = 0.0) -> Model:
+    """A state that only diffuses, with a variance of `rate` a second; at rate 0 it rests."""
+
+    def noise_cov(t: float, dt: float) -> np.ndarray:
+        return rate * dt * np.eye(dim)
+
+    return Model(dim, lambda x, t, dt: x, noise_cov)
 
 
 def model() -> LinearModel:
     """A damped oscillator with a full process noise."""
 
     def transition(dt: float) -> np.ndarray:
-        return np.exp(-0.1 * dt) * np.array(
-            [[np.cos(dt), np.sin(dt)], [-np.sin(dt), np.cos(dt)]]
-        )
+        # exp(A dt) for A = [[-0.1, 1], [-1, -0.1]]: a rotation that shrinks
+        cos = np.cos(dt)
+        sin = np.sin(dt)
+        rotation = np.array([[cos, sin], [-sin, cos]])
+        return np.exp(-0.1 * dt) * rotation
 
     return LinearModel.from_transition(
         2, transition, lambda t, dt: dt * Q, names=("x", "v"), units=("m", "m/s")
@@ -92,48 +110,58 @@ def model() -> LinearModel:
 
 
 def team(agents: int = 5) -> list[Sensor | None]:
-    """Sensors of one, two (correlated) and no readings in turn."""
-    position_and_velocity = Sensor(2, lambda x: x, NOISE, linear=lambda d: np.eye(d))
-    return [
-        [component([0], std=0.6), position_and_velocity, None][k % 3]
-        for k in range(agents)
-    ]
+    """Sensors of one number, two (correlated) numbers and none, in turn."""
+    position = component([0], std=0.6)
+    position_and_velocity = Sensor(2, lambda x: x, NOISE, linear=np.eye)
+    kinds = [position, position_and_velocity, None]
+    return [kinds[k % 3] for k in range(agents)]
 
 
+# Uneven steps: a filter that took one step for another would differ.
 TIMES = np.cumsum([0.1, 0.3, 0.2, 0.4, 0.1, 0.2, 0.3, 0.2])
 
 
 def data(
     sensors: list[Sensor | None], runs: tuple[int, ...] = (), seed: int = 0
 ) -> tuple[np.ndarray, list[np.ndarray | None]]:
-    """A truth (T, *runs, 2) and the sensors' readings."""
-    rng = np.random.default_rng(seed)
-    start = PRIOR[0] + rng.standard_normal((*runs, 2)) @ np.linalg.cholesky(PRIOR[1]).T
+    """A truth (T, *runs, 2) and the sensors' observations."""
+    rng = default_rng(seed)
+    # x = m + L z with P = L Lᵀ has the prior's moments.
+    root = np.linalg.cholesky(PRIOR_COV)
+    start = PRIOR_MEAN + rng.standard_normal((*runs, 2)) @ root.T
     truth = simulate(model(), start, TIMES, rng=rng)
-    return truth, [None if s is None else s.observe(truth, rng=rng) for s in sensors]
+    seen: list[np.ndarray | None] = []
+    for sensor in sensors:
+        seen.append(None if sensor is None else sensor.observe(truth, rng=rng))
+    return truth, seen
 
 
 def kalman(seen: Any, sensors: Any) -> tuple[Any, dict[str, Any]]:
-    """The Kalman filter of everybody's readings, with the matrices of its model."""
+    """The Kalman filter of all agents' observations, with the matrices of its model."""
     steps = np.diff(TIMES, prepend=0.0)
-    every = stack(sensors)
+    oscillator = model()
     moves = {
-        "F": np.array([model().F(dt) for dt in steps]),
+        "F": np.array([oscillator.F(dt) for dt in steps]),
         "Q": np.array([dt * Q for dt in steps]),
     }
+    # One sensor with all components stands for the network.
+    every = stack(sensors)
+    h = every.H(2)
     y = np.concatenate(seen, axis=-1)
-    return kalman_filter(*PRIOR, y, H=every.H(2), R=every.noise_cov, **moves), moves
+    return kalman_filter(*PRIOR, y, H=h, R=every.noise_cov, **moves), moves
 
 
 def make_filter(family: str, agents: int = 5, **options: Any) -> tuple[Any, Any]:
     """A filter of a family on a path of agents, and its state at the start."""
     if family.endswith("common") and options.get("fusion", 0) is None:
-        del options["fusion"]  # one round of averaging, which is as far as readings go
+        # This family needs a rule: one round of averaging reaches as far as observations.
+        del options["fusion"]
     sensors = options.pop("sensors", team(agents))
     graph = options.pop("graph", network.graphs.path(len(sensors)))
     runs = options.pop("runs", ())
-    f = FAMILIES[family](options.pop("model", model()), sensors, graph, **options)
-    return f, f.start(PRIOR, rng=np.random.default_rng(3), runs=runs)
+    motion = options.pop("model", model())
+    f = FAMILIES[family](motion, sensors, graph, **options)
+    return f, f.start(PRIOR, rng=default_rng(3), runs=runs)
 
 
 def values(state: Any) -> dict[str, np.ndarray]:

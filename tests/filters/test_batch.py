@@ -1,4 +1,4 @@
-"""Random networks, readings and options, against one joint Gaussian of all times."""
+"""Random networks, observations and options, against one joint Gaussian of all times."""
 
 from __future__ import annotations
 
@@ -40,49 +40,66 @@ FAMILIES: dict[str, Any] = {
 
 def batch(known: list[Any], times: Any, q: Any, run: Any) -> tuple[Any, Any]:
     """Means (K, 2) and covariances (K, 2, 2) at all times, given the observations of one run."""
+    # x = L [x₀, w₁, …, w_K]: the row of x_k is F times that of x_{k-1}, plus w_k.
     lift = np.eye(2 * len(times))
     steps = np.diff(times)
     for k, dt in enumerate(steps, 1):
-        lift[2 * k : 2 * k + 2] += model().F(dt) @ lift[2 * k - 2 : 2 * k]
+        now = slice(2 * k, 2 * k + 2)
+        before = slice(2 * k - 2, 2 * k)
+        lift[now] += model().F(dt) @ lift[before]
     mean = lift[:, :2] @ PRIOR[0]
-    noises = [dt * (1 + t) * q for t, dt in zip(times, steps, strict=False)]
+    # The walk's noise depends on the time at the start of a step.
+    rates = 1 + np.asarray(times[:-1])
+    noises = [scale * q for scale in steps * rates]
+    # P = L diag(P₀, Q₁, …, Q_K) Lᵀ
     cov = lift @ block_diag(PRIOR[1], *noises) @ lift.T
+    # One row for each number that arrived, whatever its time
     h = np.zeros((0, len(mean)))
     r = np.zeros((0, 0))
     y = np.zeros(0)
     for sensor, observation in known:
-        value = (
-            observation.value[run] if observation.value.ndim > 1 else observation.value
-        )
+        value = observation.value
+        # A value without an axis of runs belongs to all of them.
+        if value.ndim > 1:
+            value = value[run]
         arrived = ~np.isnan(value)
-        place = np.eye(len(times))[times.tolist().index(observation.t)]
-        h = np.concatenate([h, np.kron(place, sensor.H(2))[arrived]])
-        r = block_diag(r, sensor.noise_cov[np.ix_(arrived, arrived)])
+        # The Kronecker product puts H at the observation's time.
+        index = times.tolist().index(observation.t)
+        place = np.eye(len(times))[index]
+        rows = np.kron(place, sensor.H(2))
+        noise = sensor.noise_cov[np.ix_(arrived, arrived)]
+        h = np.concatenate([h, rows[arrived]])
+        r = block_diag(r, noise)
         y = np.concatenate([y, value[arrived]])
-    gain = np.linalg.solve(h @ cov @ h.T + r, h @ cov).T
+    # K = P Hᵀ S⁻¹ with S = H P Hᵀ + R
+    innovation_cov = h @ cov @ h.T + r
+    gain = np.linalg.solve(innovation_cov, h @ cov).T
     mean = mean + gain @ (y - h @ mean)
     cov = cov - gain @ h @ cov
-    return mean.reshape(-1, 2), np.array(
-        [cov[k : k + 2, k : k + 2] for k in range(0, len(cov), 2)]
-    )
+    # The 2 x 2 blocks of the diagonal are the covariances of single times.
+    blocks = []
+    for k in range(0, len(cov), 2):
+        block = slice(k, k + 2)
+        blocks.append(cov[block, block])
+    return mean.reshape(-1, 2), np.array(blocks)
 
 
-def price(told: list[Any], now: float) -> Any:
-    """Numbers that are there, and of each reading when it was, of which sensor, and about it."""
-    receivers = [
-        ~np.isnan(observation.value.reshape(-1, sensor.dim)).all(axis=0)
-        for sensor, observation in told
-    ]
-    numbers = sum(map(np.sum, receivers))
-    (sensor, observation), *more = told
-    if (
-        not more
-        and observation.t == now
-        and not observation.metadata
-        and observation.sensor in (0, sensor)
-    ):
+def price(payload: list[Any], now: float) -> Any:
+    """Numbers of a payload: its values, and of each observation time, sensor and metadata."""
+    numbers = 0
+    for sensor, observation in payload:
+        table = observation.value.reshape(-1, sensor.dim)
+        # A component that is missing in all runs is not sent.
+        is_missing = np.isnan(table).all(axis=0)
+        numbers += np.sum(~is_missing)
+    # One present value of the agent's only sensor needs no label.
+    (sensor, observation), *more = payload
+    is_usual = observation.t == now and observation.sensor in (0, sensor)
+    if is_usual and not more and not observation.metadata:
         return numbers
-    return numbers + sum(2 + len(observation.metadata) for _, observation in told)
+    # A label has the time, the sensor's number and the metadata.
+    labels = [2 + len(observation.metadata) for _, observation in payload]
+    return numbers + sum(labels)
 
 
 def draw_events(
@@ -101,17 +118,52 @@ def draw_events(
     events = []
     for j, a in np.ndindex(steps + 1, len(team)):
         for s, sensor in enumerate(team[a]):
-            value = rng.normal(size=(*runs[: rng.integers(2)], sensor.dim))
-            value[rng.random(value.shape) < 0.2] = np.nan
-            k = j + several * rng.integers(2) * rng.integers(lag + 1)
+            # A value for all runs, or one for each of them; a fifth of the numbers is missing.
+            leading = runs[: rng.integers(2)]
+            value = rng.normal(size=(*leading, sensor.dim))
+            lost = rng.random(value.shape) < 0.2
+            value[lost] = np.nan
+            # Half of the observations are late, by up to the lag.
+            is_late = several * rng.integers(2)
+            k = j + is_late * rng.integers(lag + 1)
             # A sensor of the observation's own travels with its metadata.
             is_private = rng.random() < 0.2
             which = sensor if is_private else s
             metadata = tuple(rng.random(is_private * rng.integers(3)))
             if 0 < k <= steps and not np.isnan(value).all():
                 observation = Observation(times[j], a, value, which, metadata=metadata)
-                events.append((k + rng.integers(2) / 2, sensor, observation))
+                arrival = k + rng.integers(2) / 2
+                events.append((arrival, sensor, observation))
     return events
+
+
+def draw_links(rng: Any, shape: tuple[int, int, int], all_or_none: bool) -> np.ndarray:
+    """Draw links (T, A, A): agent i receives from agent j at time k if links[k, i, j]."""
+    uniform = rng.random(shape)
+    links = uniform < rng.choice([0.3, 0.7])
+    if all_or_none:
+        # Increments are exact only if all agents exchange them or none does.
+        links[:] = rng.random((shape[0], 1, 1)) < 0.5
+    return links & ~np.eye(shape[1], dtype=bool)
+
+
+def find_contacts(times: np.ndarray, links: np.ndarray, every: float) -> np.ndarray:
+    """Whether agents exchange observations, at each time (T,)."""
+    contact = links.any(axis=(1, 2))
+    if every:
+        # Contacts are at the first time after each multiple of the interval.
+        intervals = np.floor(times / every)
+        contact[1:] &= np.diff(intervals) > 0
+    return contact
+
+
+def draw_team(rng: Any, agents: int) -> list[list[Sensor]]:
+    """Draw up to two sensors for each agent, which may be of one kind."""
+    team = []
+    for _ in range(agents):
+        kinds = rng.integers(3, size=rng.integers(3))
+        team.append([KINDS[k] for k in kinds])
+    return team
 
 
 def check_beliefs(
@@ -127,8 +179,12 @@ def check_beliefs(
         for t, view in views:
             place = times.tolist().index(t)
             index = (*run, a)
-            cov = view.covariance
-            result = np.cov(view.members[index].T) if cov is None else cov[index]
+            # An ensemble has members in place of a covariance.
+            if view.covariance is None:
+                result = np.cov(view.members[index].T)
+            else:
+                result = view.covariance[index]
+            # A linear Gaussian filter that loses nothing has the posterior's exact moments.
             assert np.allclose(view.mean[index], means[place], atol=1e-9)
             assert np.allclose(result, covs[place], atol=1e-9)
 
@@ -143,70 +199,63 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
     agents = rng.integers(1, 5)
     steps = rng.integers(2, 6)
     runs = (2,) if several and rng.random() < 0.5 else ()
-    team = [
-        [KINDS[k] for k in rng.integers(3, size=rng.integers(3))] for _ in range(agents)
-    ]
+    team = draw_team(rng, agents)
     times = np.cumsum(rng.uniform(0.05, 0.5, steps + 1)) - 0.3
-    links = rng.random((steps + 1, agents, agents)) < rng.choice([0.3, 0.7])
-    if family == "news":  # who hears one hears all
-        links[:] = rng.random((steps + 1, 1, 1)) < 0.5
-    links &= ~np.eye(agents, dtype=bool)
+    links = draw_links(rng, (steps + 1, agents, agents), family == "news")
     every = rng.choice([0.0, 0.3])
-    contact = links.any(axis=(1, 2))
-    if every:
-        contact[1:] &= np.diff(np.floor(times / every)) > 0
-    lag = int(rng.integers(steps + 1) if contact[1:].all() and not every else steps)
+    contact = find_contacts(times, links, every)
+    # Observations that wait for a contact need states to which they can return.
+    waits = bool(every) or not contact[1:].all()
+    lag = int(steps if waits else rng.integers(steps + 1))
     share = family != "mixture" and (family == "news" or rng.random() < 0.8)
+    # Without process noise the other families are exact as well.
     q = Q if gaussian or family == "mixture" else 0 * Q
     walk = LinearModel.from_transition(
         2, model().transition_matrix, lambda t, dt: dt * (1 + t) * q
     )
-    nets = {
-        t: Graph.from_adjacency(a, directed=True)
-        for t, a in zip(times, links, strict=True)
-    }
+    nets = {}
+    for t, adjacency in zip(times, links, strict=True):
+        nets[t] = Graph.from_adjacency(adjacency, directed=True)
     options: Any = {"lag": lag, "share_observations": share} if several else {}
     f = FAMILIES[family](
         walk, team, nets.get, exchange_interval=every or None, **options
     )
-    prior: Any = PRIOR  # or members of these moments, which exact updates keep
+    prior: Any = PRIOR
     if family == "ensemble":
-        prior = match_moments(rng.standard_normal((120, 2)), *PRIOR)
+        # Members with exactly these moments, which exact updates keep
+        draws = rng.standard_normal((120, 2))
+        prior = match_moments(draws, *PRIOR)
     events = draw_events(rng, team, times, runs, lag, several)
+    # Written out here: which observations each agent has, and which wait for a contact.
     available = [[] for _ in team]
     waiting = [[] for _ in team]
     owed = np.zeros(agents)
     state = f.start(prior, rng=rng, runs=runs, t=times[0])
-    for when in sorted({*range(1, steps + 1), *(event[0] for event in events)}):
+    arrivals = [event[0] for event in events]
+    for when in sorted({*range(1, steps + 1), *arrivals}):
         k = int(when)
-        t = times[int(when)]
-        now = [
-            [event[1:] for event in events if event[0] == when and event[2].agent == a]
-            for a in range(agents)
-        ]
-        late = [
-            observation
-            for private in now
-            for _, observation in private
-            if observation.t < t
-        ]
-        seen = [
-            [observation for _, observation in private if observation.t == t]
-            for private in now
-        ]
-        state = f.step(state, t, seen, **({"delayed": late} if several else {}))
+        t = times[k]
+        now = [[] for _ in team]
+        for arrival, sensor, observation in events:
+            if arrival == when:
+                now[observation.agent].append((sensor, observation))
+        # Observations of earlier times come as delayed ones, those of now by agent.
+        seen = [[o for _, o in private if o.t == t] for private in now]
+        late = [o for private in now for _, o in private if o.t < t]
+        delayed = {"delayed": late} if several else {}
+        state = f.step(state, t, seen, **delayed)
+        # A second step to the same time is no contact if there is an interval.
+        may_send = share and contact[k] and not (every and when > k)
         for a, private in enumerate(now):
             available[a] += private
             waiting[a] += private
-            if share and contact[k] and waiting[a] and not (every and when > k):
+            if may_send and waiting[a]:
                 for b in np.flatnonzero(links[k, :, a]):
                     available[b] += waiting[a]
                     owed[a] += price(waiting[a], t)
                 waiting[a] = []
         assert family == "news" or np.array_equal(state.ledger.scalars, owed)
-        views = [
-            (then.t, f.summarize(then))
-            for then in (state, *getattr(state, "lagged_states", ()))
-        ]
+        states = (state, *getattr(state, "lagged_states", ()))
+        views = [(then.t, f.summarize(then)) for then in states]
         assert len(views) == 1 + min(lag * several, k)
         check_beliefs(views, available, times[: k + 1], q, runs)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from distfilt.coupling import transform_ensemble
 from distfilt.coupling.transform import transport_plans
@@ -35,22 +35,25 @@ def _filter(**options: Any) -> TransportFilter:
 
 
 def _start(f: TransportFilter, runs: tuple[int, ...] = ()) -> EnsembleState:
-    return f.start(PRIOR, rng=np.random.default_rng(2), runs=runs)
+    return f.start(PRIOR, rng=default_rng(2), runs=runs)
 
 
 def _central(state: EnsembleState, seen: list[Any], steps: int) -> np.ndarray:
     """One agent with all sensors, written out; it draws the agents' common numbers."""
     x = state.ensembles[0]
     rng = state.rng
-    t = state.t
     assert rng is not None
     stacked = stack([s for s in FOUR if s is not None])
     weight = np.linalg.inv(stacked.noise_cov)
-    for k in range(steps):
-        x = model().sample_step(x, t, TIMES[k] - t, rng=rng)
-        t = TIMES[k]
-        gap = np.concatenate([o[k] for o in seen]) - stacked.predict(x, None)
-        x = transform_ensemble(x, -0.5 * np.einsum("ni,ij,nj->n", gap, weight, gap))
+    t = state.t
+    for k, now in enumerate(TIMES[:steps]):
+        x = model().sample_step(x, t, now - t, rng=rng)
+        t = now
+        y = np.concatenate([o[k] for o in seen])
+        innovation = y - stacked.predict(x, None)
+        # log p(y | x) = -½ νᵀ R⁻¹ ν, the sum of the agents' log-likelihoods
+        squared = np.einsum("ni,ij,nj->n", innovation, weight, innovation)
+        x = transform_ensemble(x, -0.5 * squared)
     return x
 
 
@@ -67,32 +70,41 @@ def test_agents_with_different_sensors_are_one_central_filter(
 ) -> None:
     f = _filter(**options)
     _, seen = data(FOUR)
-    state = list(f.steps(_start(f), TIMES, seen))[-1]
-    assert np.abs(state.ensembles - _central(_start(f), seen, len(TIMES))).max() < bound
+    *_, state = f.steps(_start(f), TIMES, seen)
+    central = _central(_start(f), seen, len(TIMES))
+    # Each agent has the sum of all log-likelihoods: exactly, or as far as rounds have converged.
+    assert np.abs(state.ensembles - central).max() < bound
 
 
 def test_only_log_likelihoods_are_sent() -> None:
-    """Two rounds on a ring of four, thirty numbers to each of two neighbours, and no reading."""
+    """Two rounds on a ring of four, thirty numbers to each of two neighbours, nothing else."""
     f = _filter()
     _, seen = data(FOUR)
-    ledger = f.step(_start(f), TIMES[0], [o[0] for o in seen]).ledger
-    assert ledger.rounds == 2 and (ledger.scalars == 2 * 2 * 30).all()
+    now = [o[0] for o in seen]
+    ledger = f.step(_start(f), TIMES[0], now).ledger
+    assert ledger.rounds == 2
+    assert (ledger.scalars == 2 * 2 * 30).all()
 
 
 def test_an_agent_whom_nobody_hears_counts_its_own_reading_once() -> None:
-    f = _filter(graph=Graph.from_edges(4, []))
+    no_links = Graph.from_edges(4, [])
+    ring = graphs.ring(4)
+    f = _filter(graph=no_links)
     y = [[0.3], [1.0], [0.5, 0.2], [-0.4]]
     separate = f.step(_start(f), 0.5, y).ensembles
-    for k in range(4):
-        one = _filter(sensors=FOUR[k : k + 1], graph=None)
-        single = one.step(_start(one), 0.5, [y[k]]).ensembles[0]
-        assert np.allclose(single, separate[k], atol=1e-13)
-    f = _filter(graph=lambda t: graphs.ring(4) if t > 0.7 else Graph.from_edges(4, []))
-    for now, late in ((y, []), ([None] * 4, [Observation(0.5, 0, [0.3])])):
-        with pytest.raises(
-            ValueError, match="graph must have links for the observations of t = 0.6"
-        ):
-            replace(f, lag=1).step(_start(f).replace(t=0.5), 0.6, now, delayed=late)
+    # Each agent is the filter of its own sensor, with the common draws.
+    for k, sensor in enumerate(FOUR):
+        one = _filter(sensors=[sensor], graph=None)
+        single = one.step(_start(one), 0.5, [y[k]])
+        assert np.allclose(single.ensembles[0], separate[k], atol=1e-13)
+    # With links at some times, agents that observe apart would no longer have one set.
+    f = _filter(graph=lambda t: ring if t > 0.7 else no_links, lag=1)
+    state = _start(f).replace(t=0.5)
+    delayed = [Observation(0.5, 0, [0.3])]
+    message = "graph must have links for the observations of t = 0.6"
+    for now, late in ((y, []), ([None] * 4, delayed)):
+        with pytest.raises(ValueError, match=message):
+            f.step(state, 0.6, now, delayed=late)
 
 
 def test_sets_stay_in_common_with_noise_and_rejuvenation_over_runs() -> None:
@@ -100,9 +112,11 @@ def test_sets_stay_in_common_with_noise_and_rejuvenation_over_runs() -> None:
     _, seen = data(FOUR, (3,))
     state = _start(f, (3,))
     assert (state.ensembles == state.ensembles[:, :1]).all()
-    last = list(f.steps(state, TIMES, seen))[-1].ensembles
-    assert np.abs(last - last[:, :1]).max() < 1e-11
-    assert np.abs(last[0] - last[1]).max() > 0.1
+    *_, last = f.steps(state, TIMES, seen)
+    x = last.ensembles
+    # Agents of one run have the same set, to rounding; runs differ.
+    assert np.abs(x - x[:, :1]).max() < 1e-11
+    assert np.abs(x[0] - x[1]).max() > 0.1
 
 
 def test_a_late_reading_weighs_all_times_with_one_coupling() -> None:
@@ -112,22 +126,24 @@ def test_a_late_reading_weighs_all_times_with_one_coupling() -> None:
     state = f.step(state, 0.5, [None] * 4)
     before = state.ensembles[0]
     plain = f.step(state, 1.0, [None] * 4).ensembles[0]
-    after = f.step(
-        state, 1.0, [None, None, None, [0.4]], delayed=[Observation(0.5, 0, [1.3])]
-    )
-    logs = (
-        -0.5 * ((1.3 - before[:, 0]) / 0.6) ** 2
-        - 0.5 * ((0.4 - plain[:, 0]) / 0.8) ** 2
-    )
+    delayed = [Observation(0.5, 0, [1.3])]
+    after = f.step(state, 1.0, [None, None, None, [0.4]], delayed=delayed)
+    # The sum of both log-likelihoods, each at the member's state of its time
+    first = (1.3 - before[:, 0]) / 0.6
+    second = (0.4 - plain[:, 0]) / 0.8
+    logs = -0.5 * (first**2 + second**2)
     w = np.exp(logs - logs.max())
     w /= w.sum()
-    assert np.allclose(after.ensembles[2], transform_ensemble(plain, logs), atol=1e-11)
-    assert np.allclose(after.history[-1][1][1].mean(axis=0), w @ before, atol=1e-12)
+    expected = transform_ensemble(plain, logs)
+    assert np.allclose(after.ensembles[2], expected, atol=1e-11)
+    past = after.history[-1][1][1]
+    assert np.allclose(past.mean(axis=0), w @ before, atol=1e-12)
 
 
 def test_weights_of_a_run_that_failed_are_no_collapse(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    # A solver that gives up on the weights of a distant observation
     def wary(x: np.ndarray, logs: np.ndarray) -> np.ndarray:
         if np.ptp(logs, axis=-1).max() > 1e4:
             raise SolverError("too far")
@@ -137,19 +153,20 @@ def test_weights_of_a_run_that_failed_are_no_collapse(
     f = TransportFilter(
         model(), [component([0], std=0.6)], None, members=30, on_error="keep"
     )
-    start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(2,))
-    with pytest.warns(
-        ParticleCollapse, match="squared distance from an ensemble's predictions"
-    ):
-        assert f.step(start, 0.5, [[[0.3], [3e4]]]).failed.tolist() == [False, True]
+    start = f.start(PRIOR, rng=default_rng(0), runs=(2,))
+    # Only the distance is warned of; a failed run has no weights that could collapse.
+    message = "squared distance from an ensemble's predictions"
+    with pytest.warns(ParticleCollapse, match=message):
+        state = f.step(start, 0.5, [[[0.3], [3e4]]])
+    assert state.failed.tolist() == [False, True]
 
 
 def test_a_step_without_any_reading_moves_nothing() -> None:
     f = _filter(rejuvenation=0.3)
     state = _start(f)
     after = f.step(state, 0.5, [None] * 4)
+    # Neither a transformation nor rejuvenation: only the model's step, with the same draws.
     rng = _start(f).rng
     assert rng is not None
-    assert (
-        after.ensembles[0] == model().sample_step(state.ensembles[0], 0.0, 0.5, rng=rng)
-    ).all()
+    moved = model().sample_step(state.ensembles[0], 0.0, 0.5, rng=rng)
+    assert (after.ensembles[0] == moved).all()

@@ -29,7 +29,8 @@ def _joint_states(
         state = f @ state + np.eye(D, size, D * k)
         rows.append(state)
     joint_mean = np.concatenate([mean, np.zeros(D * STEPS)])
-    return np.concatenate(rows), joint_mean, block_diag(cov, *model["Q"])
+    joint_cov = block_diag(cov, *model["Q"])
+    return np.concatenate(rows), joint_mean, joint_cov
 
 
 @given(seed=st.integers(0, 10**6), missing=st.sampled_from([0.0, 0.3, 1.0]))
@@ -53,8 +54,10 @@ def test_filter_and_smoother_are_conditioning_of_the_joint_gaussian(
     c = h @ states
     r = block_diag(*model["R"])[np.ix_(present, present)]
     innovation_cov = c @ joint_cov @ c.T + r
+    # K = Cov(x, y) S⁻¹, mean = E x + K (y - E y), Cov = (X - K C) P Xᵀ
     gain = np.linalg.solve(innovation_cov, c @ joint_cov @ states.T).T
-    means = states @ joint_mean + gain @ (values - c @ joint_mean)
+    innovation = values - c @ joint_mean
+    means = states @ joint_mean + gain @ innovation
     covs = (states - gain @ c) @ joint_cov @ states.T
     np.testing.assert_allclose(smooth.means.ravel(), means, rtol=0, atol=1e-9)
     for k in range(STEPS):
@@ -63,6 +66,7 @@ def test_filter_and_smoother_are_conditioning_of_the_joint_gaussian(
         np.testing.assert_allclose(smooth.covariances[k], block, rtol=0, atol=1e-9)
     if present.any():
         expected = multivariate_normal(c @ joint_mean, innovation_cov).logpdf(values)
+        # p(y) = Π p(y_k | y_1 ... y_{k-1}): the increments of the filter add up.
         total = run.log_likelihood.sum()
         np.testing.assert_allclose(total, expected, rtol=1e-11, atol=1e-10)
 
@@ -77,12 +81,14 @@ def test_runs_are_smoothed_independently(missing: float) -> None:
     y[rng.random(y.shape) < missing] = np.nan
     run = kalman_filter(np.zeros(D), np.eye(D), y, **model)
     smooth = rts_smoother(run, **matrices)
+    # Without gaps one covariance serves all runs: it does not depend on the values.
     assert smooth.covariances.shape == run.covariances.shape
     assert (smooth.covariances == smooth.covariances.mT).all()
     for k in range(RUNS):
         single = kalman_filter(np.zeros(D), np.eye(D), y[:, k], **model)
         single = rts_smoother(single, **matrices)
-        np.testing.assert_allclose(smooth.means[:, k], single.means, rtol=0, atol=1e-12)
+        means = smooth.means[:, k]
+        np.testing.assert_allclose(means, single.means, rtol=0, atol=1e-12)
 
 
 def test_run_axes_broadcast() -> None:
@@ -93,6 +99,7 @@ def test_run_axes_broadcast() -> None:
     means = rng.standard_normal((3, D))
     covs = spd(rng, D, (2, 1))
     run = kalman_filter(means, covs, y, **model)
+    # (2, 3) of the observations, (3,) of the means and (2, 1) of the covariances
     assert run.means.shape == (STEPS, 2, 3, D)
     assert run.log_likelihood.shape == (STEPS, 2, 3)
     single = kalman_filter(means[2], covs[1, 0], y[:, 1, 2], **model)
@@ -120,6 +127,7 @@ def test_no_steps_and_no_runs_give_empty_results(steps: int, runs: int) -> None:
 @pytest.mark.parametrize("shared", [True, False])
 def test_a_singular_innovation_covariance_raises(shared: bool) -> None:
     """R so small that H P Hᵀ + R is singular in floating point."""
+    # Two observations of one state: 1e30 (1 1; 1 1) + 1e-10 I rounds to rank one.
     y = np.zeros((1, 3, 2))
     if not shared:
         # Another pattern of missing components gives each run its own covariance.

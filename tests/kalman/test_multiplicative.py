@@ -40,6 +40,7 @@ def test_local_inverts_retract(dim: int, first: int) -> None:
     chart = QuaternionChart(dim, first)
     rng = np.random.default_rng(dim)
     x = rng.standard_normal((5, dim))
+    # Rotations of less than π, for which the error is unique
     e = 0.5 * rng.standard_normal((5, dim - 1))
     result = chart.retract(x, e)
     assert np.abs(chart.local(x, result) - e).max() < 1e-13
@@ -59,7 +60,8 @@ def test_retract_rotates_the_quaternion_and_adds_to_other_components(
     rotated = rotate(x[:, q], e[:, first : first + 3])
     assert np.allclose(result[:, q], rotated, atol=1e-15)
     lengths = np.linalg.norm(x[:, q], axis=1)
-    assert np.abs(np.linalg.norm(result[:, q], axis=1) - lengths).max() < 1e-13
+    new_lengths = np.linalg.norm(result[:, q], axis=1)
+    assert np.abs(new_lengths - lengths).max() < 1e-13
     # The other components of state and error
     others = np.delete(np.arange(dim), q)
     other_errors = np.delete(np.arange(dim - 1), slice(first, first + 3))
@@ -91,10 +93,12 @@ def test_projection_inverts_the_basis_and_ignores_the_quaternion_s_length(
     cov = spd(rng, dim - 1)
     # B P Bᵀ is the covariance of states whose errors have the covariance P.
     basis = chart.tangent_basis(x)
-    assert np.allclose(chart.project(x, basis @ cov @ basis.mT), cov)
+    state_cov = basis @ cov @ basis.mT
+    assert np.allclose(chart.project(x, state_cov), cov)
     # A change of the length along the quaternion is no error.
     along = np.zeros_like(x)
-    along[:, first : first + 4] = x[:, first : first + 4]
+    quaternion = slice(first, first + 4)
+    along[:, quaternion] = x[:, quaternion]
     radial = along[..., None] * along[:, None]
     assert np.abs(chart.project(x, radial)).max() < 1e-13
 
@@ -106,9 +110,11 @@ def test_a_flat_chart_gives_the_extended_kalman_filter() -> None:
     start = np.array([0.0, 0.0, 1.0, 0.0, 0.2])
     cov = 0.1 * spd(rng, 5)
     sensors = [range_bearing([0, 1], std=[0.1, 0.05], origin=[3.0, 0.1])]
-    y = stack(sensors).observe(start + 0.1 * rng.standard_normal((3, 4, 5)), rng=rng)
+    states = start + 0.1 * rng.standard_normal((3, 4, 5))
+    y = stack(sensors).observe(states, rng=rng)
     y[1, 2, 0] = np.nan
     options = {"model": model, "sensors": sensors, "times": [0.3, 0.8, 1.8]}
+    # With x + e as retraction the error-state filter is the extended filter.
     result = mekf(start, cov, y, chart=_FlatChart(5, 0), **options)
     expected = filterpy_ekf(start, cov, y, **options)
     np.testing.assert_allclose(result.means, expected.means, rtol=0, atol=1e-13)
@@ -148,6 +154,7 @@ def test_errors_are_propagated_by_the_derivative_of_the_transition_in_the_chart(
     q = spd(rng, 13)
     pose = satellite_pose(rate=0.3, sigma=0.0)
     model = replace(pose, noise_cov=lambda t, dt: (1 + t) * q)
+    # An increment depends on both ends of the step, whose errors are correlated.
     run = mekf(
         x,
         cov,
@@ -172,13 +179,15 @@ def test_errors_are_propagated_by_the_derivative_of_the_transition_in_the_chart(
 
     zero = np.zeros(12)
     forecast = end(zero)
-    # Initial errors and noises are independent: (e, w) with a block diagonal covariance.
+    # Initial errors and noises are independent: (e, w) with a block diagonal
+    # covariance.
     joint = block_diag(cov, POSE.project(forecast, q))
     # Final error A e + w, and observed increment C e + H B w
     a = np.hstack([central_difference(end_error, zero), np.eye(12)])
     noise_part = POSE.tangent_basis(forecast)[[9, 11]]
     c = np.hstack([central_difference(change, zero), noise_part])
     innovation_cov = c @ joint @ c.T + 0.09 * np.eye(2)
+    # Cov(end error | y) = (A - K C) P Aᵀ with K = A P Cᵀ S⁻¹
     gain = np.linalg.solve(innovation_cov, c @ joint @ a.T).T
     expected = (a - gain @ c) @ joint @ a.T
     assert np.allclose(run.covariances[0], expected, atol=1e-6)
@@ -252,6 +261,7 @@ def test_the_uncertainty_of_an_attitude_is_consistent_and_its_length_conserved()
     x0 = np.array([*translation, 0.3, 0.2, 0.1, 1.0, 0.0, 0.0, 0.0])
     cov = 0.01 * np.eye(12)
     errors = 0.1 * rng.standard_normal((runs, 12))
+    # The truth is drawn from the filter's prior.
     truth = POSE.retract(np.broadcast_to(x0, (runs, 13)), errors)
     times = 0.1 * np.arange(1, 21)
     states = simulate(model, truth, times, rng=rng)
@@ -260,8 +270,8 @@ def test_the_uncertainty_of_an_attitude_is_consistent_and_its_length_conserved()
     run = mekf(x0, cov, y, chart=POSE, model=model, sensors=sensors, times=times)
     # eᵀ P⁻¹ e, summed over the runs, is χ² distributed with 12 degrees of freedom each.
     error = POSE.local(run.means[-1], states[-1])
-    whitened = np.linalg.solve(run.covariances[-1], error[..., None])[..., 0]
-    nees = (error * whitened).sum()
+    whitened = np.linalg.solve(run.covariances[-1], error[..., None])
+    nees = (error * whitened[..., 0]).sum()
     low, high = chi2.ppf([5e-4, 1 - 5e-4], 12 * runs)
     assert low < nees < high
     lengths = np.linalg.norm(run.means[..., 9:], axis=-1)

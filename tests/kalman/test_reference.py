@@ -76,7 +76,8 @@ def test_the_kalman_filter_equals_filterpy_s(
     if missing != "none":
         # The same pattern for all runs, or one for each
         patterns = 1 if missing == "common" else runs
-        y = np.where(rng.random((30, patterns, M)) < 0.3, np.nan, y)
+        is_missing = rng.random((30, patterns, M)) < 0.3
+        y = np.where(is_missing, np.nan, y)
     result = kalman_filter(mean, cov, y, **model)
     expected = filterpy_kf(mean, cov, y, **model)
     covs = np.broadcast_to(result.covariances, expected.covariances.shape)
@@ -89,6 +90,7 @@ def test_the_kalman_filter_equals_filterpy_s(
     is_shared = missing != "individual" and not priors
     assert result.covariances.shape == (30, 1 if is_shared else runs, D, D)
     assert (covs == covs.mT).all()
+    # Thirty steps of rounding leave covariances symmetric and positive definite.
     assert np.linalg.eigvalsh(covs).min() > 0
 
 
@@ -150,6 +152,7 @@ def test_an_angle_may_wrap(filter_: Callable[..., Any]) -> None:
         "sensors": [bearing([0, 1], std=0.01)],
         "times": [1e-9],
     }
+    # The mean's bearing is just below π, the observed one just above -π.
     mean = np.array([-1.0, 0.02])
     cov = 0.01 * FULL / 4
     run = filter_(mean, cov, [[-np.pi + 0.02]], **options)
@@ -163,7 +166,7 @@ def test_an_angle_may_wrap(filter_: Callable[..., Any]) -> None:
     np.testing.assert_allclose(wrapped.means, run.means, atol=1e-12)
 
 
-def test_what_the_sensor_cannot_see_is_missing() -> None:
+def test_an_undefined_bearing_is_missing() -> None:
     """A mean at the sensor's position has no bearing; the distance is used nevertheless."""
     options = {
         "model": walk(2),
@@ -203,8 +206,11 @@ def test_extended_steps_are_the_linearised_formulas(
     p = FULL
     for t, dt in ((0.0, 2.0), (2.0, 0.5)):
         # P ← J P Jᵀ + Q(t, dt), with the Jacobian at the last mean
-        jacobian = np.array([[np.cos(x[0]), 0.0], [x[1] * dt, x[0] * dt]])
-        p = jacobian @ p @ jacobian.T + (1 + t) * dt * FULL
+        first_row = [np.cos(x[0]), 0.0]
+        second_row = [x[1] * dt, x[0] * dt]
+        jacobian = np.array([first_row, second_row])
+        noise_cov = (1 + t) * dt * FULL
+        p = jacobian @ p @ jacobian.T + noise_cov
         x = transition(x, t, dt)
     missing = [np.nan, np.nan]
     forecast = filter_(start, FULL, [missing, missing], **options)

@@ -24,6 +24,7 @@ CURVES = st.lists(
 @given(CURVES, st.integers(0, 2**32 - 1))
 def test_digest_survives_rounding(values, seed):
     curve = np.array(values)
+    # Relative errors of 1e-9 are more than another processor makes.
     noise = np.random.default_rng(seed).uniform(-1, 1, curve.size)
     assert digest(curve=curve * (1 + 1e-9 * noise)) == digest(curve=curve)
     # Errors of the last bit of the largest entry, as other processors make
@@ -38,6 +39,7 @@ def test_digest_survives_rounding(values, seed):
 def test_digest_is_steady_at_round_numbers(value):
     # A tie of the rounding at a round number would make the digits unstable.
     curve = np.array([value, 0.3 * value, -0.7 * value, 1.0])
+    # Errors of both signs round to the same text, so no tie lies there.
     texts = {digest(c=curve * (1 + e)) for e in (0.0, 1e-9, -1e-9, 1e-13, -1e-13)}
     assert len(texts) == 1
 
@@ -46,6 +48,7 @@ def test_digest_sees_order_sign_and_size():
     t = np.linspace(0, 6, 200)
     curve = np.sin(t)
     for other in (
+        # Each change keeps some numbers of the digest; the order keeps range and mean.
         curve[::-1],
         -curve,
         1.001 * curve,
@@ -63,6 +66,7 @@ def test_digest_sees_order_sign_and_size():
 
 
 def test_digest_text():
+    # Numbers that are 0 up to rounding print as 0, without a sign.
     assert digest(a=[], b=np.zeros(3)) == (
         "a: 0 values\nb: 3 values, 0..0, mean 0, projection 0"
     )
@@ -72,6 +76,7 @@ def test_digest_text():
         "a: 4 values, 1..2, mean 1.5,"
     )
     assert digest(a=[np.nan, 1.0, np.inf, 2.0]) != text
+    # The mean of a full period is 0 up to rounding.
     assert "mean 0," in digest(a=np.sin(np.linspace(0, 2 * np.pi, 101)[:-1]))
     assert digest(a=np.array([123456, 234567])).startswith(
         "a: 2 values, 1.235e+05..2.346e+05"
@@ -98,6 +103,7 @@ def picture(change: str = "") -> Figure:
     """Draw two panels with every kind of artist, one of them changed."""
     figure = Figure(figsize=(6, 3))
     first, second = figure.subplots(1, 2)
+    # One artist at a time is larger by one percent.
     scale = {name: 1.01 if name == change else 1.0 for name in CHANGED}
     if change == "swapped panels":
         first, second = second, first

@@ -15,6 +15,7 @@ def test_wrapper_made_inside_a_function_is_pickled() -> None:
     update = with_inflation(enkf, factor=1.1)
     copy = pickle.loads(cloudpickle.dumps(update))
     x = np.random.default_rng(0).standard_normal((5, 2))
+    # Equal draws, so equal numbers if the copy is the same function
     results = [
         f(x, x[:, :1], [0.5], [[1.0]], rng=np.random.default_rng(1))
         for f in (update, copy)

@@ -57,6 +57,7 @@ PAIR = [[0, 1], [1, 0]]
 
 
 def test_colour_and_style_pairs_repeat_late():
+    # 8 and 5 have no common divisor: the pair repeats after 40.
     assert len({(colour(k), str(line_style(k))) for k in range(40)}) == 40
     assert (
         len(set(PALETTE)) == 8 and len({str(line_style(8 * k)) for k in range(5)}) == 5
@@ -85,6 +86,7 @@ def test_ellipse_holds_its_share():
     assert np.allclose(squared, -2 * np.log(0.2), rtol=1e-10)
     assert ax.lines[0].get_color() == PALETTE[1] and ax.lines[0].get_label() == "A"
     assert ax.lines[1].get_xydata().tolist() == [mean.tolist()]
+    # A covariance of rank one gives a line.
     line = (
         plotting.ellipse(blank(), mean, [[4.0, 0.0], [0.0, 0.0]]).lines[0].get_xydata()
     )
@@ -150,6 +152,7 @@ def test_a_slider_holds_its_frames_and_nothing_else():
     )
     assert result.labels == ("rate 0 1/s", "rate 0.5 1/s", "rate 1 1/s", "rate 2 1/s")
     assert len(set(result.frames)) == 4 and not pyplot.get_fignums()
+    # The page has one picture and one slider, and all frames as data.
     find, data = parse(result.html)
     (image,) = find("img")
     (knob,) = find("input")
@@ -169,12 +172,14 @@ def test_a_slider_holds_its_frames_and_nothing_else():
     assert knob["aria-label"] == "rate" and len(find("button")) == 1
     assert [base64.b64decode(f) for f in data["frames"]] == list(result.frames)
     assert data["said"] == list(result.labels) and data["milliseconds"] == 500
+    # It needs no network: no address, and no script from a file.
     assert "http" not in result.html and not any(
         "src" in s.attrs for s in find("script")
     )
     assert len(result.html) < 100_000
     bundle = result._repr_mimebundle_()
     assert set(bundle) == {"text/plain", "text/html", "image/png"}
+    # The picture for print is the frame that is shown first.
     still = Image.open(io.BytesIO(base64.b64decode(bundle["image/png"])))
     assert (np.asarray(still) == np.asarray(first_frame)).all()
 
@@ -185,6 +190,7 @@ def test_a_slider_is_reproducible_and_its_text_changes_with_a_frame():
         slider(curve, [0.5, last], label="rate", alt="A curve.")
         for last in (1.0, 1.0, 1.01, 0.99)
     ]
+    # Equal arguments give equal bytes; a changed curve another text.
     assert sliders[0].html == sliders[1].html and len({repr(s) for s in sliders}) == 3
     assert (
         len({re.search('data-frames="([0-9a-f]{16})"', s.html)[1] for s in sliders})
@@ -194,6 +200,7 @@ def test_a_slider_is_reproducible_and_its_text_changes_with_a_frame():
 
 def test_texts_of_a_slider_cannot_end_its_script():
     result = slider(curve, [1.0], label="rate", alt="</script><b>x</b>")
+    # The parser would find the bold text if the script had ended.
     find, data = parse(result.html)
     assert data["alt"] == "</script><b>x</b>" and not find("b")
 
@@ -204,6 +211,7 @@ def test_a_table_formats_numbers_and_marks_the_best_one():
     )
     result = ResultTable(frame, form={"m": ".2f"}, best={"m": "min"}, caption="Error")
     page = BeautifulSoup(result._repr_html_(), "html.parser")
+    # NaN is no best value, and is shown.
     rows = [[c.text for c in row.find_all(["th", "td"])] for row in page.find_all("tr")]
     assert rows == [
         ["", "m", "rule"],

@@ -52,6 +52,7 @@ def test_every_published_file_is_of_an_item_and_lists_its_claims() -> None:
     of_item = {(i.paper, i.file) for i in items()}
     assert files
     for path in files:
+        # A figure has claims; a table has values, and claims in a second file.
         rows = table(path.parent.name, path.stem)
         claims = path.stem.startswith("figure") or path.stem.endswith("-claims")
         assert rows and (path.parent.name, path.stem.removesuffix("-claims")) in of_item
@@ -78,6 +79,7 @@ def test_the_data_are_those_of_the_working_copy(
     deep = tmp_path / "book" / "deep"
     for folder in (tmp_path / "data" / "published", deep):
         folder.mkdir(parents=True)
+    # A chapter may run in any folder below the data.
     monkeypatch.chdir(deep)
     assert data_root() == repository_data  # another project's data is passed over
     (tmp_path / "data" / "published" / "items.csv").touch()
@@ -115,6 +117,7 @@ def test_a_fault_is_named_with_the_file(
     path = tmp_path / "some" / "study.toml"
     path.write_text(GOOD)
     study = read_scenario(path)
+    # Without the fault the file is read.
     assert study["gain"] == 0.05 and study.changes == (
         "some/study is no scenario of the book",
     )
@@ -126,6 +129,7 @@ def test_a_fault_is_named_with_the_file(
 def test_values_are_the_file_s_and_cannot_be_changed() -> None:
     assert S["gain"] == 0.05 and S["members"] == 200 and "gain" in S and "gian" not in S
     assert S["initial_state"].tolist() == [100.0, 0.0, 0.0, 10.0, 0.1, 0.0]
+    # A study that changed its input would no longer be the one that is described.
     with pytest.raises(ValueError, match="read-only"):
         S["initial_state"][0] = 0.0
     assert S.agents[1].dims == (1, 2) and S.agents[1]["noise"] == 0.2
@@ -173,6 +177,7 @@ def test_a_changed_file_is_noticed_by_its_values(
     )
     path = tmp_path / "grange" / "table-2.toml"
     path.parent.mkdir()
+    # Values count, texts such as the place in the paper do not.
     path.write_text(text.replace(old, new))
     other = read_scenario(path)
     assert (
@@ -186,6 +191,7 @@ def test_a_scenario_prints_every_parameter_and_its_reason() -> None:
     text = " ".join(repr(S).split())
     page = S._repr_html_()
     markdown = S._repr_markdown_()
+    # Each form of the table has every parameter with its source and reason.
     for p in (*S.parameters.values(), *S.notes.values()):
         assert p.name in text and f">{p.name}<" in page and f"| {p.name} |" in markdown
         assert p.source in markdown and p.why.replace("|", r"\|") in markdown
@@ -203,6 +209,7 @@ def test_a_scenario_prints_every_parameter_and_its_reason() -> None:
 
 
 def test_reads_of_agents_are_recorded() -> None:
+    # Two recordings of one scenario are independent.
     one = S.track_reads()
     two = S.track_reads()
     # Showing a scenario, or asking for changes, reads no cell for the study.
@@ -211,7 +218,9 @@ def test_reads_of_agents_are_recorded() -> None:
     assert (
         first.dims == (0, 1) and first.get("noise") == 0.2 and first.where == "Table II"
     )
+    # A worker of a study gets a copy, with the cells read so far.
     travelled = pickle.loads(pickle.dumps(one))
+    # Rows are matched by name, in any order.
     assert (
         one.cells()
         == [{"name": "A", "dims": (0, 1), "noise": 0.2}, {"name": "B"}, {"name": "C"}]
@@ -244,6 +253,7 @@ def test_used_values_are_read_as_printed(item: str, name: str) -> None:
 def test_an_unused_cell_is_not_read() -> None:
     study = S.track_reads()
     for a in study.agents:
+        # All cells but the neighbours are read.
         a.dims, a.noise, a.kind  # noqa: B018
     verdict = judge_parameters("grange", "Table II", study)
     why = "row A, neighbours: printed [A,B,C], not read by the study"
@@ -268,6 +278,7 @@ def test_rows_are_judged_to_the_first_difference(
         "grange", "Table II", [ROWS[0], {**ROWS[1], **change}, ROWS[2]]
     )
     assert (verdict.verdict, verdict.why) == ("differs" if why else "read", why)
+    # A row too few or too many is a difference as well.
     assert judge_parameters("grange", "Table II", ROWS[:2]).why.startswith(
         "row C is printed"
     )
@@ -292,9 +303,11 @@ def test_every_claim_has_to_hold() -> None:
     assert "unstable" in match.published and match.why == ""
     differs = judge_claims("grange", "Fig. 1", DENIED, why="it is an EnKF")
     assert (differs.verdict, differs.why) == ("differs", "it is an EnKF")
+    # A difference needs a reason, a match has none.
     assert "pca-stable fails" in differs.ours
     with pytest.raises(ValueError, match="^why must give a reason"):
         judge_claims("grange", "Fig. 1", DENIED)
+    # A claim left out, one twice, and one that is not listed
     for claims in (
         CLAIMS[:2],
         [*CLAIMS, CLAIMS[2]],
@@ -331,6 +344,7 @@ def test_a_verdict_is_stored_in_a_notebook() -> None:
     verdict = Verdict("grange", "Fig. 1", "differs", "a", "b", "because <so>")
     bundle = verdict._repr_mimebundle_()
     data = bundle["application/vnd.distfilt.verdict+json"]
+    # The ledger reads the verdict back from the notebook's JSON.
     assert Verdict(**json.loads(json.dumps(data))) == verdict
     assert bundle["text/plain"] == (
         "grange Fig. 1: differs\n  ours       a\n  published  b\n  why        because <so>"
@@ -340,6 +354,7 @@ def test_a_verdict_is_stored_in_a_notebook() -> None:
 
 def test_a_changed_scenario_is_not_compared() -> None:
     for verdict in (
+        # Neither a match nor a difference says anything about another scenario.
         judge_claims("grange", "Fig. 1", CLAIMS, scenario=CHANGED),
         judge_claims("grange", "Fig. 1", DENIED, why="x", scenario=CHANGED),
         judge_parameters("grange", "Table II", ROWS, scenario=CHANGED),

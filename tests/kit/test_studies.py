@@ -33,6 +33,7 @@ def draw(seed: SeedSequence) -> list[float]:
 
 
 def fails_at(bad: tuple[int, ...], seed: SeedSequence) -> list[float]:
+    # `spawn` numbers the trials by their spawn keys.
     if seed.spawn_key[0] in bad:
         raise ArithmeticError(f"no value for {seed.spawn_key[0]}")
     return draw(seed)
@@ -60,6 +61,7 @@ def store(path: Path, **options: Any) -> Path:
 
 
 def test_neither_workers_nor_executor_change_a_bit() -> None:
+    # Sums depend on their order and on the number of threads; both are fixed.
     assert bits(studies.run(draw, SEEDS, workers=2)) == REFERENCE
     with ThreadPoolExecutor(3) as threads:
         assert bits(studies.run(draw, SEEDS, executor=threads)) == REFERENCE
@@ -72,6 +74,7 @@ def test_seeds_are_numpy_s_own_children_whatever_was_spawned_from_them() -> None
     for ours, theirs in zip(
         studies.spawn(2023, 5), SeedSequence(2023).spawn(5), strict=True
     ):
+        # Spawning by the caller must not shift the children that a trial spawns.
         first = theirs.spawn(3)[0].generate_state(2)
         study = studies.run(
             lambda s: s.spawn(1)[0].generate_state(2), [ours, theirs], workers=1
@@ -90,6 +93,7 @@ def test_values_that_share_a_buffer_are_kept_apart() -> None:
         buffer[0] = seed.spawn_key[0]
         return buffer
 
+    # A thread shares the buffer with this test; a process would copy it.
     with ThreadPoolExecutor(1) as pool:
         study = studies.run(trial, studies.spawn(1, 9), executor=pool)
     assert study.metrics(["k"])["k"].tolist() == list(range(9))
@@ -129,6 +133,7 @@ def test_a_raised_trial_is_reported_with_its_seed_and_the_others_are_kept(
     assert study.failures[1].kind == "ArithmeticError"
     assert "spawn_key=(11,)" in str(study.failures[1])
     assert "no value for 11" in str(study.failures[1])
+    # The reported seed makes the same trial fail here.
     with pytest.raises(ArithmeticError):
         trial(study.failures[0].seed)
     with pytest.raises(StudyError, match="trial 3, SeedSequence") as caught:
@@ -142,6 +147,7 @@ def test_a_killed_worker_costs_its_own_trial_only(bad: int, tmp_path: Path) -> N
         StudyError, match=f"trial {bad}, .*(?s:.*)the other trials are in .*.part"
     ):
         store(tmp_path / "a.csv", trial=partial(dies_at, bad), workers=2)
+    # All trials but the one that kills its worker are stored.
     rows = (tmp_path / "a.csv.part").read_text().splitlines()[-29:]
     assert sorted(int(row.split(",")[0]) for row in rows) == [
         k for k in range(30) if k != bad
@@ -151,6 +157,7 @@ def test_a_killed_worker_costs_its_own_trial_only(bad: int, tmp_path: Path) -> N
 
 def test_a_broken_executor_leaves_what_was_done() -> None:
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        # An executor of the caller cannot be replaced, so the study stops.
         with pytest.raises(StudyError, match="the executor broke") as caught:
             studies.run(partial(dies_at, 29), SEEDS, executor=pool)
         assert caught.value.study is not None and 0 < caught.value.study.done.sum() < 30
@@ -167,6 +174,7 @@ class Cluster(Executor):
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
         self.calls.append((future, fn, args))
+        # Nothing runs before all slots are taken: fewer calls would wait for ever.
         if len(self.calls) == self._max_workers:
             self.on_full(self.calls)
             for pending, call, arguments in self.calls:
@@ -221,6 +229,7 @@ def test_a_file_gives_back_every_bit(whole: Path) -> None:
 )
 def test_any_number_and_seed_comes_back(
     tmp_path_factory: pytest.TempPathFactory,
+    # Infinite, NaN and subnormal numbers, and seeds of any size, must survive as text.
     numbers: list[float],
     entropy: int,
     key: list[int],
@@ -234,6 +243,7 @@ def test_any_number_and_seed_comes_back(
     for name, number in zip(columns, numbers, strict=True):
         assert np.array_equal(study.metric(name), [number], equal_nan=True)
         assert (
+            # array_equal takes -0.0 for 0.0; NaN has no sign that counts.
             np.signbit(study.metric(name)[0]) == np.signbit(number) or number != number
         )
     assert (study.seed(0).generate_state(4) == seed.generate_state(4)).all()
@@ -243,6 +253,7 @@ def test_a_failure_is_stored_by_its_class(tmp_path: Path) -> None:
     study = studies.load(store(tmp_path / "a.csv", trial=partial(fails_at, (3,))))
     assert study.failures[3] == "ArithmeticError" and np.isnan(study.columns["mean"][3])
     assert study.metric("mean").shape == (29,)
+    # A failure of the same kind is the stored result.
     studies.check(study, partial(fails_at, (3,)))
     with pytest.raises(
         AssertionError, match="trial 3: stored ArithmeticError, now a value"
@@ -251,6 +262,7 @@ def test_a_failure_is_stored_by_its_class(tmp_path: Path) -> None:
 
 
 def test_every_flipped_bit_is_refused_by_name(whole: Path, tmp_path: Path) -> None:
+    # The checksum in the head covers all bytes after it.
     raw = whole.read_bytes()
     path = tmp_path / "b.csv"
     rng = np.random.default_rng(1)
@@ -283,6 +295,7 @@ def test_a_row_that_was_cut_off_or_damaged_runs_again(
     part = tmp_path / "a.csv.part"
     assert store(path, indices=range(20)) == part
     text = part.read_text()
+    # A row cut in the middle, a changed digit, a cut head, an empty file
     position = text.index("\n4,")
     for damaged in (
         text[:-9],
@@ -301,6 +314,7 @@ def test_parts_of_several_machines_merge(whole: Path, tmp_path: Path) -> None:
     # Parts overlap in two trials, which are stored once.
     assert (tmp_path / "a.csv.part").read_text().count("\n7,") == 1
     assert store(tmp_path / "a.csv").read_bytes() == whole.read_bytes()
+    # Parts of two different studies must not mix.
     store(tmp_path / "b.csv", indices=[0], parameters={"size": 41})
     with pytest.raises(ValueError, match="must have the same code, parameters and"):
         studies.merge(
@@ -330,6 +344,7 @@ def test_a_part_of_another_study_is_refused(
 def test_a_full_disk_is_named_and_loses_nothing(whole: Path, tmp_path: Path) -> None:
     most = len(whole.read_bytes()) * 6 // 10
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # A limit on the size of files has the same effect as a full disk.
     resource.setrlimit(resource.RLIMIT_FSIZE, (most, limits[1]))
     try:
         with pytest.raises(OSError, match=r"File too large: .*a\.csv\.part"):
@@ -337,6 +352,7 @@ def test_a_full_disk_is_named_and_loses_nothing(whole: Path, tmp_path: Path) -> 
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert (tmp_path / "a.csv.part").stat().st_size == most
+    # With space again the run continues, and the file is the same.
     assert store(tmp_path / "a.csv").read_bytes() == whole.read_bytes()
 
 
@@ -356,6 +372,7 @@ def test_another_run_is_compared(
     def trial(seed: SeedSequence) -> list[float]:
         return [x * (1 + change) for x in draw(seed)]
 
+    # A relative change passes if one of the tolerances covers it.
     chosen = [0, 4, 29]
     if passes:
         assert len(studies.check(whole, trial, indices=chosen, **options)) == 30
@@ -377,6 +394,7 @@ def test_a_difference_names_another_code(whole: Path) -> None:
     def other(seed: SeedSequence) -> list[float]:
         return [2 * x for x in draw(seed)]
 
+    # The stored fingerprint is found by the function's name.
     other.__qualname__ = draw.__qualname__
     with pytest.raises(AssertionError, match="the source of the trial differs"):
         studies.check(whole, other, indices=[0])

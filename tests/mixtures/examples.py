@@ -50,6 +50,7 @@ def assert_same(
 
 def sort_components(p: GaussianMixture) -> np.ndarray:
     """Rows of means, weights and covariances, sorted by the rounded mean."""
+    # Rounding first: equal components of two mixtures are sorted alike.
     rows = np.c_[p.means, p.weights, p.covs.reshape(p.n_components, -1)]
     return np.array(sorted(rows.round(12).tolist()))
 

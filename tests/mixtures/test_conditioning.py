@@ -40,14 +40,17 @@ def test_linear_problems_are_the_kalman_filter(seed: int, d: int) -> None:
     # Forecast: F m and F P Fᵀ + Q.
     forecast = propagate_mixture(p, lambda x: x @ f.T, q)
     assert np.allclose(forecast.means, p.means @ f.T)
-    assert np.allclose(forecast.covs, f @ p.covs @ f.T + q @ q.T)
+    propagated = f @ p.covs @ f.T
+    assert np.allclose(forecast.covs, propagated + q @ q.T)
     # Update with the gain K = P Hᵀ S⁻¹ of each component.
     y = 3 * rng.standard_normal(2)
     analysis = update_mixture(forecast, y, lambda x: x @ h.T, r)
     predicted = forecast.means @ h.T
     innovation_cov = h @ forecast.covs @ h.T + r
     gain = np.linalg.solve(innovation_cov, h @ forecast.covs).mT
-    means = forecast.means + (gain @ (y - predicted)[..., None])[..., 0]
+    innovation = y - predicted
+    correction = gain @ innovation[..., None]
+    means = forecast.means + correction[..., 0]
     covs = forecast.covs - gain @ innovation_cov @ gain.mT
     # Weights by the likelihood; negligible components are left out.
     likelihoods = []
@@ -55,25 +58,32 @@ def test_linear_problems_are_the_kalman_filter(seed: int, d: int) -> None:
         likelihoods.append(multivariate_normal(mean, cov).pdf(y))
     w = forecast.weights * np.array(likelihoods)
     large = w > 1e-9 * w.sum()
-    assert np.allclose(analysis.weights, w[large] / w[large].sum())
+    expected_weights = w[large] / w[large].sum()
+    assert np.allclose(analysis.weights, expected_weights)
     assert np.allclose(analysis.means, means[large], atol=1e-7)
     assert np.allclose(analysis.covs, covs[large], atol=1e-7)
 
 
 def test_curvature_adds_to_the_covariance() -> None:
-    # The variance of x² is 4 m² P + 2 P², which DD2 meets; its covariance with x is 2 m P.
+    # The variance of x² is 4 m² P + 2 P², which DD2 meets; its covariance with x is 2 m
+    # P.
     m = 1.5
     p = 0.8
     r = 0.3
     y = 4.0
     prior = GaussianMixture.gaussian([m], [[p]])
     spread = 4 * m**2 * p + 2 * p**2
-    forecast = propagate_mixture(prior, lambda x: x**2, np.full((1, 1), np.sqrt(r)))
+    noise_factor = np.full((1, 1), np.sqrt(r))
+    forecast = propagate_mixture(prior, lambda x: x**2, noise_factor)
     assert np.allclose(forecast.covs, spread + r)
-    analysis = update_mixture(prior, np.array([y]), lambda x: x**2, np.full((1, 1), r))
-    gain = 2 * m * p / (spread + r)
-    assert np.allclose(analysis.means, m + gain * (y - m**2 - p))
-    assert np.allclose(analysis.covs, p - gain**2 * (spread + r))
+    noise = np.full((1, 1), r)
+    analysis = update_mixture(prior, np.array([y]), lambda x: x**2, noise)
+    # The predicted mean is E x² = m² + P.
+    innovation = y - (m**2 + p)
+    innovation_cov = spread + r
+    gain = 2 * m * p / innovation_cov
+    assert np.allclose(analysis.means, m + gain * innovation)
+    assert np.allclose(analysis.covs, p - gain**2 * innovation_cov)
 
 
 def test_steps_do_not_depend_on_coordinates_or_order() -> None:
@@ -96,7 +106,8 @@ def test_steps_do_not_depend_on_coordinates_or_order() -> None:
         p, lambda x: move(to_original(x)) @ matrix.T + shift, 0.1 * matrix
     )
     forecast = transform(forecast, inverse, inverse_shift)
-    assert_same(forecast, propagate_mixture(P, move, 0.1 * np.eye(3)), 1e-8)
+    expected = propagate_mixture(P, move, 0.1 * np.eye(3))
+    assert_same(forecast, expected, 1e-8)
     # An update in other coordinates, and of components in another order.
     y = np.array([0.5, 1.0])
     expected = update_mixture(P, y, lambda x: move(x) @ H.T, R)
@@ -109,11 +120,13 @@ def test_steps_do_not_depend_on_coordinates_or_order() -> None:
 def test_a_missing_component_has_no_influence() -> None:
     """Not by the correlation of its noise with the others' either."""
     noise = np.array([[1.0, 0.9], [0.9, 2.0]])
-    part = update_mixture(P, np.array([np.nan, 1.0]), lambda x: x @ H.T, noise)
-    assert_same(
-        part, update_mixture(P, np.ones(1), lambda x: x @ H[1:].T, noise[1:, 1:])
-    )
-    assert update_mixture(P, np.full(2, np.nan), lambda x: x @ H.T, noise) is P
+    y = np.array([np.nan, 1.0])
+    part = update_mixture(P, y, lambda x: x @ H.T, noise)
+    # The marginal noise of the observed component is its block of R.
+    expected = update_mixture(P, np.ones(1), lambda x: x @ H[1:].T, noise[1:, 1:])
+    assert_same(part, expected)
+    nothing = np.full(2, np.nan)
+    assert update_mixture(P, nothing, lambda x: x @ H.T, noise) is P
 
 
 def test_a_component_that_predicts_nothing_is_left_out() -> None:
@@ -122,7 +135,9 @@ def test_a_component_that_predicts_nothing_is_left_out() -> None:
 
     two = GaussianMixture([0.5, 0.5], [[-9.0], [9.0]], np.ones((2, 1, 1)))
     after = update_mixture(two, np.full(1, 8.0), half_blind, np.eye(1))
-    assert after.n_components == 1 and np.allclose(after.means, 8.5)
+    # The other one is updated with the gain P / (P + R) = 1/2: from 9 to 8.5.
+    assert after.n_components == 1
+    assert np.allclose(after.means, 8.5)
     with pytest.raises(ValueError, match="^observed must be predicted by"):
         update_mixture(two, np.full(1, 8.0), lambda x: np.nan * x, np.eye(1))
 
@@ -134,7 +149,8 @@ def test_angles_that_wrap_between_points() -> None:
     def wrap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return (a - b + np.pi) % (2 * np.pi) - np.pi
 
-    # Bearings near ±π, and the same problem turned by a right angle, where nothing wraps.
+    # Bearings near ±π, and the same problem turned by a right angle, where nothing
+    # wraps.
     position = np.array([-5.0, 0.01])
     rotation = np.array([[0.0, -1.0], [1.0, 0.0]])
     noise = 0.01 * np.eye(1)
@@ -165,7 +181,9 @@ def test_a_gate_measures_from_the_nearest_component() -> None:
     distance = np.sqrt(y @ np.linalg.solve(cov + noise, y))
     assert is_inside(y.tolist(), 1.001 * distance)
     assert not is_inside(y.tolist(), 0.999 * distance)
-    assert is_inside([50.0, np.nan], 3.0) and not is_inside([25.0, np.nan], 3.0)
+    # The second component is at 50; halfway between both, 25 is far from each.
+    assert is_inside([50.0, np.nan], 3.0)
+    assert not is_inside([25.0, np.nan], 3.0)
 
 
 def test_the_split_library_has_moments_and_least_error_of_the_normal() -> None:
@@ -173,10 +191,14 @@ def test_the_split_library_has_moments_and_least_error_of_the_normal() -> None:
     x = np.linspace(-9, 9, 20001)
     for std, limit in ((0.5, 1.5e-2), (0.7, 2e-3), (0.9, 1e-4)):
         w, m = split_library(std=std)
-        assert np.isclose(w.sum(), 1) and (w > 0).all() and np.isclose(w @ m, 0)
+        # Σ w = 1, Σ w m = 0 and Σ w m² + σ² = 1: the moments of N(0, 1).
+        assert np.isclose(w.sum(), 1)
+        assert (w > 0).all()
+        assert np.isclose(w @ m, 0)
         assert np.isclose(w @ m**2 + std**2, 1)
 
         def ise(a: float, std: float = std) -> float:
+            # 2 a m² + σ² = 1 fixes the means once a is chosen.
             m = np.sqrt((1 - std**2) / (2 * a))
             weights = [a, 1 - 2 * a, a]
             means = [[-m], [0.0], [m]]
@@ -185,14 +207,19 @@ def test_the_split_library_has_moments_and_least_error_of_the_normal() -> None:
             error = np.exp(p.log_density(x[:, None])) - normal
             return float(np.trapezoid(error**2, x))
 
-        assert ise(w[0]) <= min(ise(0.9 * w[0]), ise(1.1 * w[0])) + 1e-12 < limit
+        least = ise(w[0])
+        nearby = min(ise(0.9 * w[0]), ise(1.1 * w[0]))
+        assert least <= nearby + 1e-12 < limit
 
 
 def test_splits_keep_the_moments() -> None:
     split = split_components(P, [1, 3], U, std=0.6)
-    assert split.n_components == 8 and np.linalg.eigvalsh(split.covs).min() > 0
+    # Two of four components become three each.
+    assert split.n_components == 8
+    assert np.linalg.eigvalsh(split.covs).min() > 0
     assert np.allclose(split.mean, P.mean)
     assert np.allclose(split.cov, P.cov, rtol=1e-12)
+    # The components that stay come first; a split one shares its weight among three.
     assert np.allclose(split.weights[:2], P.weights[[0, 2]])
     assert np.isclose(split.weights[2:5].sum(), P.weights[1])
     # The same in other coordinates.
@@ -208,8 +235,11 @@ def test_stretching_is_the_largest_image() -> None:
     scale = np.array([1.0, 3.0])
     u, length = nonlinearity(P.factors, g, scale=scale)
     for k in range(4):
-        assert np.isclose(u[k] @ np.linalg.solve(P.covs[k], u[k]), 1)
-        assert np.isclose(np.linalg.norm(scale * (g[k] @ u[k])), length[k])
+        # uᵀ P⁻¹ u = 1: one standard deviation; its image has the length ‖D G u‖.
+        squared_distance = u[k] @ np.linalg.solve(P.covs[k], u[k])
+        assert np.isclose(squared_distance, 1)
+        image = scale * (g[k] @ u[k])
+        assert np.isclose(np.linalg.norm(image), length[k])
         # No other direction of one standard deviation has a larger image.
         z = rng.standard_normal((500, 3))
         z /= np.linalg.norm(z, axis=1, keepdims=True)
@@ -223,9 +253,12 @@ def test_the_most_stretched_are_split_while_there_is_room() -> None:
 
     two = GaussianMixture([0.5, 0.5], [[-5.0], [5.0]], np.ones((2, 1, 1)))
     once = split_nonlinear(two, slope, max_components=4, split_threshold=0.6)
-    assert once.n_components == 4 and (once.means > 0).sum() == 3
+    # The slope is 4 at the second component, which is split into three.
+    assert once.n_components == 4
+    assert (once.means > 0).sum() == 3
     # .5 · 4 is above the limit, and so is its middle piece, of deviation .7.
     twice = split_nonlinear(two, slope, max_components=50, split_threshold=0.6)
     assert twice.n_components == 6
+    # No room for two more components, or no stretching above the threshold.
     assert split_nonlinear(two, slope, max_components=3, split_threshold=0.6) is two
     assert split_nonlinear(two, slope, max_components=50, split_threshold=2.5) is two

@@ -51,15 +51,21 @@ def fuse_by_information(
     """
     inv = np.linalg.inv
     n = others[0][0].dim
+    # Y = P_q⁻¹ + (ω_0 - 1) P_p⁻¹ + Σ ω_b P_b⁻¹ on the target block, and Y m alike.
     info = inv(prior.covs[q])
-    vector = inv(prior.covs[q]) @ prior.means[q]
-    factors = [(w[0] - 1, prior.means[p, :n], prior.covs[p, :n, :n])]
+    vector = info @ prior.means[q]
+    marginal_mean = prior.means[p, :n]
+    marginal_cov = prior.covs[p, :n, :n]
+    divisor = (w[0] - 1, marginal_mean, marginal_cov)
+    factors = [divisor]
     for a, (other, r) in zip(w[1:], others, strict=True):
         factors.append((a, other.means[r], other.covs[r]))
     for a, mean, cov in factors:
-        info[:n, :n] += a * inv(cov)
-        vector[:n] += a * inv(cov) @ mean
-    return inv(info) @ vector, inv(info)
+        factor_info = a * inv(cov)
+        info[:n, :n] += factor_info
+        vector[:n] += factor_info @ mean
+    fused_cov = inv(info)
+    return fused_cov @ vector, fused_cov
 
 
 @given(st.integers(0, 200), st.floats(0.05, 0.95), st.integers(1, 4), st.integers(0, 3))
@@ -67,6 +73,7 @@ def test_gaussians_are_fused_exactly(seed: int, omega: float, n: int, e: int) ->
     prior = random_mixture(1, n + e, seed)
     other = random_mixture(1, n, seed + 1)
     mean, cov = fuse_by_information(prior, 0, 0, [(other, 0)], [omega, 1 - omega])
+    # With one component each both methods have nothing to approximate.
     for fused in (
         fuse_mixtures(prior, other, omega=omega),
         fuse_moments(prior, other, omega=omega),
@@ -79,10 +86,13 @@ def test_matched_terms_are_always_definite_and_others_may_not_be() -> None:
     dropped = 0
     for seed in range(40):
         prior = random_mixture(3, 4, seed, 1.0)
-        f = PartialFusion(prior, random_mixture(3, 2, 500 + seed, 1.0))
+        other = random_mixture(3, 2, 500 + seed, 1.0)
+        f = PartialFusion(prior, other)
         matched = f.component_shapes()
         every = f.component_shapes(terms="all")
-        assert matched.dropped == 0 and matched.n_components == 9
+        # With p = q the divisor (1 - ω_0) P_q⁻¹ leaves a definite rest; p ≠ q may not.
+        assert matched.dropped == 0
+        assert matched.n_components == 9
         assert every.n_components + every.dropped == 27
         for shapes in (matched, every):
             assert np.linalg.eigvalsh(shapes.covs).min() > 0
@@ -91,15 +101,20 @@ def test_matched_terms_are_always_definite_and_others_may_not_be() -> None:
 
 
 def test_the_target_marginal_of_the_exact_density_by_quadrature() -> None:
-    f = PartialFusion(random_mixture(2, 3, 5, 1.0), random_mixture(2, 2, 6, 1.0))
+    prior = random_mixture(2, 3, 5, 1.0)
+    other = random_mixture(2, 2, 6, 1.0)
+    f = PartialFusion(prior, other)
     e = np.linspace(-40, 40, 8001)
     for t in ([0.0, 0.5], [1.0, -1.0]):
         x = np.column_stack([np.broadcast_to(t, (e.size, 2)), e])
+        # ∫ p(t, e) de
         mass = np.trapezoid(np.exp(f.log_value(x)), e)
-        assert np.isclose(np.log(mass), f.log_target(np.array(t)), atol=1e-9)
+        log_target = f.log_target(np.array(t))
+        assert np.isclose(np.log(mass), log_target, atol=1e-9)
 
 
 def test_omega_at_its_ends() -> None:
+    # With ω = 1 all received beliefs have the exponent zero.
     assert fuse_mixtures(PRIOR, OTHER, omega=1.0) is PRIOR
     other = random_mixture(1, 2, 8)
     # With ω = 0 the target marginal is the other belief.
@@ -112,6 +127,7 @@ def test_omega_at_its_ends() -> None:
 def test_exponents_are_equal_by_default() -> None:
     others = [OTHER, random_mixture(2, 2, 3), random_mixture(1, 2, 4)]
     assert PartialFusion(PRIOR, others).exponents.tolist() == [0.25] * 4
+    # The received beliefs share the remainder 1 - ω equally.
     exponents = PartialFusion(PRIOR, others, omega=0.4).exponents
     assert np.allclose(exponents, [0.4, 0.2, 0.2, 0.2])
     fused = fuse_moments(PRIOR, others, omega=[0.25] * 4)
@@ -125,14 +141,15 @@ def test_exponents_are_equal_by_default() -> None:
 def test_many_agents_in_one_pass_and_one_after_the_other() -> None:
     prior = random_mixture(1, 5, 30)
     others = [random_mixture(1, 2, 31 + k) for k in range(3)]
-    # Gaussians are fused exactly, so that the order does not matter with equal exponents.
+    # Gaussians are fused exactly, so that the order does not matter with equal
+    # exponents.
     expected = fuse_mixtures(prior, others)
     for order in (others, others[::-1]):
         assert_same(fuse_sequentially(prior, order), expected)
     halves = fuse_sequentially(prior, others, omega=0.5, pair=fuse_moments)
-    assert_same(
-        halves, fuse_mixtures(prior, others, omega=[1 / 8, 1 / 8, 1 / 4, 1 / 2])
-    )
+    # Each fusion halves the exponents of all beliefs that came before.
+    omega = [1 / 8, 1 / 8, 1 / 4, 1 / 2]
+    assert_same(halves, fuse_mixtures(prior, others, omega=omega))
     # With halves the order matters.
     reverse = fuse_sequentially(prior, others[::-1], omega=0.5)
     assert not np.allclose(halves.means, reverse.means)
@@ -145,8 +162,10 @@ def test_three_mixtures_by_information(terms: str) -> None:
     x = np.random.default_rng(0).standard_normal((5, 4))
     # log p(x) + (ω - 1) log p(t) + Σ ω_b log p_b(t)
     t = x[:, :2]
-    expected = PRIOR.log_density(x) - 0.5 * PRIOR.marginal(TARGET).log_density(t)
-    expected += 0.2 * OTHER.log_density(t) + 0.3 * third.log_density(t)
+    target_log = PRIOR.marginal(TARGET).log_density(t)
+    expected = PRIOR.log_density(x) - 0.5 * target_log
+    expected += 0.2 * OTHER.log_density(t)
+    expected += 0.3 * third.log_density(t)
     assert np.allclose(f.log_value(x), expected, rtol=1e-12)
     shapes = f.component_shapes(terms=terms)
     source = []
@@ -160,6 +179,7 @@ def test_three_mixtures_by_information(terms: str) -> None:
             source.append(q)
             means.append(mean)
             covs.append(cov)
+    # A term is a choice of q, r and s, and of the divisor p unless p = q.
     n_terms = 3 * 2 * 3 * (3 if terms == "all" else 1)
     assert shapes.n_components + shapes.dropped == n_terms
     assert np.array_equal(shapes.source, source)
@@ -179,16 +199,15 @@ def test_fusion_in_other_coordinates_and_in_another_order(
     shuffled_others = [shuffle(m) for m in others]
     shuffled = fuse_mixtures(shuffle(PRIOR), shuffled_others, rule=rule, terms=terms)
     assert_same(shuffled, fused, 1e-6)
-    # Sigma points depend on the square root, which other coordinates rotate unless they only scale.
+    # Sigma points depend on the square root, which other coordinates rotate unless they
+    # only scale.
     matrix, shift = random_frame(4, target_dim=2)
     if rule == "points":
         matrix = np.diag(np.geomspace(1e-3, 1e5, 4))
-    transformed = fuse_mixtures(
-        transform(PRIOR, matrix, shift),
-        [transform(m, matrix[:2, :2], shift[:2]) for m in others],
-        rule=rule,
-        terms=terms,
-    )
+    prior = transform(PRIOR, matrix, shift)
+    target_matrix = matrix[:2, :2]
+    received = [transform(m, target_matrix, shift[:2]) for m in others]
+    transformed = fuse_mixtures(prior, received, rule=rule, terms=terms)
     inverse = np.linalg.inv(matrix)
     assert_same(transform(transformed, inverse, -inverse @ shift), fused, 1e-5)
 
@@ -199,25 +218,29 @@ def test_weights_are_the_printed_formulas(rule: str) -> None:
     f = PartialFusion(PRIOR, OTHER, omega=0.6)
     shapes = f.component_shapes()
     if rule in ("C1", "C2"):
-        coefficients = closed_form_coefficients(f, shapes, rule)
+        coefficients = density_coefficients(f, shapes, rule)
     else:
         coefficients = collocation_coefficients(f, shapes, rule)
     # The weight of a term is its coefficient times the integral of exp(-½ xᵀ P⁻¹ x).
-    w = coefficients * np.sqrt(np.linalg.det(2 * np.pi * shapes.covs))
+    determinants = np.linalg.det(2 * np.pi * shapes.covs)
+    w = coefficients * np.sqrt(determinants)
     weights = f.assign_weights(shapes, rule=rule).weights
+    # Terms of negative or zero weight are left out.
     assert np.allclose(weights, w[w > 0] / w.sum(), rtol=1e-6)
 
 
-def closed_form_coefficients(
+def density_coefficients(
     f: PartialFusion, shapes: ComponentShapes, rule: str
 ) -> np.ndarray:
     """Density at the means: of the source component alone for C1, of the mixture for C2."""
     means = shapes.means
-    parts = np.exp(PRIOR.component_log_densities(means)) * PRIOR.weights
+    densities = np.exp(PRIOR.component_log_densities(means))
+    parts = densities * PRIOR.weights
     if rule == "C1":
         density = parts[np.arange(len(means)), shapes.source]
     else:
         density = parts.sum(axis=1)
+    # log of the factor by which fusion multiplies the prior
     update = f.log_value(means) - PRIOR.log_density(means)
     return density * np.exp(update)
 
@@ -236,7 +259,9 @@ def collocation_coefficients(
     p = np.exp(logs - logs.max())
     differences = points[:, None] - shapes.means
     white = np.linalg.solve(shapes.covs, differences[..., None])[..., 0]
-    matrix = np.exp(-0.5 * (differences * white).sum(axis=-1))
+    # Column l is the term exp(-½ (x - m_l)ᵀ P_l⁻¹ (x - m_l)) at all points x.
+    squares = (differences * white).sum(axis=-1)
+    matrix = np.exp(-0.5 * squares)
     scale = np.ones(p.size) if rule == "C3" else 1 / np.sqrt(p + 1e-3)
     return nonnegative_least_squares(matrix * scale[:, None], p * scale)
 
@@ -246,17 +271,22 @@ def test_condition_of_least_squares(
     condition: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     uniform = np.random.default_rng(0).uniform(size=(9, 4))
+    # Columns that are nearly equal
     a = uniform @ np.diag([1.0, 1.0, 1.0, 1e-6]) + 1.0
     s = np.linalg.svd(a, compute_uv=False)
     alpha = tikhonov(s[0], s[-1], condition=condition)
     padded = np.concatenate([a, alpha * np.eye(4)])
-    b = np.r_[a @ [1.0, 2.0, 0.5, 1.0], np.zeros(4)]
+    # min |A w - b|² + α² |w|² is least squares with α I below A.
+    exact = a @ [1.0, 2.0, 0.5, 1.0]
+    b = np.r_[exact, np.zeros(4)]
     w = nonnegative_least_squares(a, b[:9], condition=condition)
     slope = padded.T @ (padded @ w - b)
     # The conditions of Karush, Kuhn and Tucker.
-    assert np.abs(slope[w > 0]).max() < 1e-9 and (slope[w == 0] > -1e-9).all()
+    assert np.abs(slope[w > 0]).max() < 1e-9
+    assert (slope[w == 0] > -1e-9).all()
     # Of the many solutions of fewer equations than unknowns the shortest.
-    assert np.allclose(nonnegative_least_squares([[1.0, 2.0]], [5.0]), [1.0, 2.0])
+    shortest = nonnegative_least_squares([[1.0, 2.0]], [5.0])
+    assert np.allclose(shortest, [1.0, 2.0])
     # A solver that stops short on either side is noticed, and another one is used.
     for factor in (0.99, 1.01):
         result = (factor * w, 0.0)
@@ -267,52 +297,61 @@ def test_condition_of_least_squares(
 
 def test_least_squares_have_a_limit() -> None:
     """Beyond it the components with the largest weights by C2 take part."""
-    f = PartialFusion(random_mixture(5, 3, 1, 1.0), random_mixture(5, 2, 2, 1.0))
+    prior = random_mixture(5, 3, 1, 1.0)
+    other = random_mixture(5, 2, 2, 1.0)
+    f = PartialFusion(prior, other)
     shapes = f.component_shapes()
     c2 = f.assign_weights(f.component_shapes(), rule="C2")
     few = f.assign_weights(shapes, at_most=6).means
-    best = c2.means[np.argsort(-c2.weights)[:6]]
-    assert {tuple(m) for m in few} <= {tuple(m) for m in best}
+    heaviest = np.argsort(-c2.weights)[:6]
+    best = {tuple(m) for m in c2.means[heaviest]}
+    assert {tuple(m) for m in few} <= best
 
 
 @EVERY_RULE
 @pytest.mark.parametrize("terms", ["matched", "all"])
 def test_components_far_apart_leave_no_nan(rule: str, terms: str) -> None:
-    prior = GaussianMixture(
-        [0.5, 0.5], [[0.0, 0.0], [1e3, 0.0]], [np.eye(2), np.eye(2)]
-    )
+    prior_means = [[0.0, 0.0], [1e3, 0.0]]
+    prior = GaussianMixture([0.5, 0.5], prior_means, [np.eye(2), np.eye(2)])
     other = GaussianMixture([0.5, 0.5], [[0.0], [-1e3]], [[[1.0]], [[0.5]]])
     fused = fuse_mixtures(prior, other, rule=rule, terms=terms)
-    assert np.isfinite(fused.weights).all() and np.isclose(fused.weights.sum(), 1)
+    # Densities of the distant pairs underflow: only their logarithms are finite.
+    assert np.isfinite(fused.weights).all()
+    assert np.isclose(fused.weights.sum(), 1)
     assert np.isfinite(fused.log_density([0.0, 0.0]))
-    assert fused.weights[np.abs(fused.means[:, 0]) < 1].sum() > 0.99
+    # The components at zero agree and get the weight.
+    is_near_zero = np.abs(fused.means[:, 0]) < 1
+    assert fused.weights[is_near_zero].sum() > 0.99
 
 
 def test_average_keeps_the_conditional_and_averages_the_target() -> None:
     prior = random_mixture(1, 4, 40)
     other = random_mixture(3, 2, 41)
     mixed = average_mixtures(prior, other, omega=0.3)
-    x = np.random.default_rng(0).standard_normal((20, 4)) * 2
+    x = 2 * np.random.default_rng(0).standard_normal((20, 4))
     t = x[:, :2]
     # log(ω p(t) + (1 - ω) p_b(t))
-    first = np.log(0.3) + prior.marginal(TARGET).log_density(t)
+    prior_target = prior.marginal(TARGET).log_density(t)
+    first = np.log(0.3) + prior_target
     second = np.log(0.7) + other.log_density(t)
     target = mixed.marginal(TARGET).log_density(t)
     assert np.allclose(target, np.logaddexp(first, second), rtol=1e-10)
-    given_t = prior.log_density(x) - prior.marginal(TARGET).log_density(t)
+    # p(e | t) is the prior's.
+    given_t = prior.log_density(x) - prior_target
     assert np.allclose(mixed.log_density(x) - target, given_t, rtol=1e-9)
     several = random_mixture(3, 4, 42)
     mixed = average_mixtures(several, other)
     matrix, shift = random_frame(4, target_dim=2)
-    # A received component is shared by the prior's in proportion to their densities at its mean.
+    # A received component is shared by the prior's in proportion to their densities at
+    # its mean.
     logs = several.marginal(TARGET).component_log_densities(other.means)
     shares = several.weights * np.exp(logs)
-    shares *= 0.5 * (other.weights / shares.sum(axis=1))[:, None]
+    scale = other.weights / shares.sum(axis=1)
+    shares *= 0.5 * scale[:, None]
     weights = np.concatenate([0.5 * several.weights, shares.ravel()])
     assert np.allclose(mixed.weights, weights)
-    transformed = average_mixtures(
-        transform(several, matrix, shift), transform(other, matrix[:2, :2], shift[:2])
-    )
+    received = transform(other, matrix[:2, :2], shift[:2])
+    transformed = average_mixtures(transform(several, matrix, shift), received)
     assert_same(transformed, transform(mixed, matrix, shift), 1e-7)
 
 
@@ -330,20 +369,22 @@ def test_agents_fuse_the_marginals_that_they_receive() -> None:
         expected = fuse_mixtures(belief, others)
         assert np.array_equal(result.means, expected.means)
         assert np.array_equal(result.weights, expected.weights)
-    # A component is a weight, two means and three entries of a covariance; 1 has two receivers.
+    # A component is a weight, two means and three entries of a covariance; 1 has two
+    # receivers.
     assert channel.ledger.scalars.tolist() == [12, 24, 12]
 
 
 def test_the_fusion_of_beliefs_is_an_option() -> None:
-    rule = partial(
-        target_fusion, target_dim=2, fuse=partial(fuse_sequentially, pair=fuse_moments)
-    )
+    fuse = partial(fuse_sequentially, pair=fuse_moments)
+    rule = partial(target_fusion, target_dim=2, fuse=fuse)
     assert kind_of_rule(rule) == "mixtures"
     fused = rule(BELIEFS, Channel(graphs.complete(3)))
     # With equal exponents the order does not matter: all have the same Gaussian target.
+    expected = fused[0].marginal(TARGET)
     for m in fused[1:]:
-        assert np.allclose(m.means[0, :2], fused[0].means[0, :2])
-        assert np.allclose(m.covs[0, :2, :2], fused[0].covs[0, :2, :2])
+        target = m.marginal(TARGET)
+        assert np.allclose(target.means[0], expected.means[0])
+        assert np.allclose(target.covs[0], expected.covs[0])
 
 
 def test_an_agent_that_receives_nothing_keeps_its_belief() -> None:
@@ -356,8 +397,10 @@ def test_a_collapse_names_the_agent_the_component_and_the_cause() -> None:
     def naive(
         prior: GaussianMixture, received: list[GaussianMixture]
     ) -> GaussianMixture:
+        # λ_min - 2 λ_min < 0: the second covariance becomes indefinite.
         covs = prior.covs.copy()
-        covs[1] -= 2 * np.linalg.eigvalsh(covs[1])[0] * np.eye(prior.dim)
+        least = np.linalg.eigvalsh(covs[1])[0]
+        covs[1] -= 2 * least * np.eye(prior.dim)
         return GaussianMixture.construct(prior.weights, prior.means, covs)
 
     with pytest.raises(

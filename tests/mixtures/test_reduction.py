@@ -53,21 +53,26 @@ def merge_by_brute_force(p: GaussianMixture, size: int) -> GaussianMixture:
     def merge(i: int, j: int) -> tuple[float, np.ndarray, np.ndarray]:
         # Weight, mean and covariance of both are kept.
         total = w[i] + w[j]
-        mean = (w[i] * m[i] + w[j] * m[j]) / total
+        weighted_sum = w[i] * m[i] + w[j] * m[j]
+        mean = weighted_sum / total
         cov = np.zeros_like(c[i])
         for k in (i, j):
             difference = m[k] - mean
-            cov += w[k] / total * (c[k] + np.outer(difference, difference))
+            share = w[k] / total
+            cov += share * (c[k] + np.outer(difference, difference))
         return total, mean, cov
 
     def cost(i: int, j: int) -> float:
         # B_ij = ½ [(w_i + w_j) log|P_ij| - w_i log|P_i| - w_j log|P_j|]
         total, _, cov = merge(i, j)
-        separate = w[i] * np.linalg.slogdet(c[i])[1] + w[j] * np.linalg.slogdet(c[j])[1]
-        return 0.5 * float(total * np.linalg.slogdet(cov)[1] - separate)
+        first = w[i] * np.linalg.slogdet(c[i])[1]
+        second = w[j] * np.linalg.slogdet(c[j])[1]
+        merged = total * np.linalg.slogdet(cov)[1]
+        return 0.5 * float(merged - (first + second))
 
     while len(w) > size:
-        i, j = min(combinations(range(len(w)), 2), key=lambda pair: cost(*pair))
+        pairs = combinations(range(len(w)), 2)
+        i, j = min(pairs, key=lambda pair: cost(*pair))
         w[i], m[i], c[i] = merge(i, j)
         del w[j], m[j], c[j]
     return GaussianMixture(np.array(w), np.array(m), np.array(c))
@@ -92,7 +97,9 @@ def test_reduction_keeps_the_moments_in_any_coordinates(
     n_components = 1 + seed % size
     reduced = runnalls(p, n_components)
     assert reduced.n_components == min(n_components, size)
-    assert np.allclose(reduced.mean, p.mean) and np.allclose(reduced.cov, p.cov)
+    # Every merger keeps the moments of its pair, so that the mixture keeps its own.
+    assert np.allclose(reduced.mean, p.mean)
+    assert np.allclose(reduced.cov, p.cov)
     # Costs are differences of log determinants, which coordinates do not change.
     matrix, shift = random_frame(dim)
     transformed = runnalls(transform(p, matrix, shift), n_components)
@@ -114,6 +121,7 @@ def test_ties_do_not_depend_on_rounding() -> None:
 def test_a_component_without_weight_goes_first() -> None:
     p = GaussianMixture([0.5, 0.0, 0.5], [[0.0], [5.0], [9.0]], np.ones((3, 1, 1)))
     reduced = runnalls(p, 2)
+    # Its merger costs nothing and moves nothing.
     assert np.allclose(reduced.means.ravel(), [0.0, 9.0])
     assert np.allclose(reduced.weights, 0.5)
 
@@ -123,16 +131,19 @@ def test_the_heaviest_absorb_the_others_first() -> None:
     for n in (1, 5):
         q = runnalls(p, n, heaviest=40)
         assert q.n_components == n
-        assert np.allclose(q.mean, p.mean) and np.allclose(q.cov, p.cov)
+        assert np.allclose(q.mean, p.mean)
+        assert np.allclose(q.cov, p.cov)
+    # With a limit as large as the mixture nothing is absorbed in advance.
     assert_same(runnalls(p, 5, heaviest=300), runnalls(p, 5))
     # A light component joins the near heavy one; one without weight changes nothing.
     means = [[0.0], [9.0], [1.0], [2.0]]
     q = GaussianMixture([0.45, 0.45, 0.1, 0.0], means, np.ones((4, 1, 1)))
     assert np.allclose(runnalls(q, 2, heaviest=2).weights, [0.55, 0.45])
-    # Near means a low cost: the wide component absorbs one that lies closer to the narrow one.
-    q = GaussianMixture(
-        [0.45, 0.45, 0.1], [[0.0], [4.0], [1.5]], [[[0.01]], [[9.0]], [[1.0]]]
-    )
+    # Near means a low cost: the wide component absorbs one that lies closer to the
+    # narrow one.
+    means = [[0.0], [4.0], [1.5]]
+    covs = [[[0.01]], [[9.0]], [[1.0]]]
+    q = GaussianMixture([0.45, 0.45, 0.1], means, covs)
     assert np.allclose(runnalls(q, 2, heaviest=2).weights, [0.45, 0.55])
 
 
@@ -144,7 +155,9 @@ def test_the_relevance_rule_is_41_without_its_guards(
     one = random_mixture(7, 2, 1)
     two = random_mixture(8, 2, 2)
     relevance = cross_relevance(one, two)
-    assert np.allclose(relevance, one.weights[:, None] * gaussian_divergences(one, two))
+    # w_i KL(p_i‖q_j); a component is irrelevant if its least value exceeds 3 δ_min.
+    divergences = gaussian_divergences(one, two)
+    assert np.allclose(relevance, one.weights[:, None] * divergences)
     delta = relevance.min(axis=1)
     irrelevant = delta > 3.0 * delta.min()
     reduced = merge_irrelevant(one, two, threshold=3.0)
@@ -152,17 +165,17 @@ def test_the_relevance_rule_is_41_without_its_guards(
     # The last component has the moments of all irrelevant ones.
     weights = one.weights[irrelevant]
     assert np.isclose(reduced.weights[-1], weights.sum())
-    group = GaussianMixture(
-        weights / weights.sum(), one.means[irrelevant], one.covs[irrelevant]
-    )
+    means = one.means[irrelevant]
+    covs = one.covs[irrelevant]
+    group = GaussianMixture(weights / weights.sum(), means, covs)
     assert np.allclose(reduced.means[-1], group.mean)
     assert np.allclose(reduced.covs[-1], group.cov)
     assert np.allclose(reduced.cov, one.cov)
     # The same in other coordinates.
     matrix, shift = random_frame(2)
-    transformed = merge_irrelevant(
-        transform(one, matrix, shift), transform(two, matrix, shift), threshold=3.0
-    )
+    moved_one = transform(one, matrix, shift)
+    moved_two = transform(two, matrix, shift)
+    transformed = merge_irrelevant(moved_one, moved_two, threshold=3.0)
     assert_same(transformed, transform(reduced, matrix, shift))
 
 
@@ -179,22 +192,27 @@ def test_a_shared_component_does_not_collapse_the_mixture(seed: int, size: int) 
     shared = GaussianMixture.gaussian(far.means[0], far.covs[0])
     reduced = merge_irrelevant(far, shared, threshold=1.5)
     distances = np.abs(reduced.means - far.means[0]).sum(axis=1)
-    assert reduced.n_components >= 2 and distances.min() < 1e-12
+    # The shared component is still one of the mixture's.
+    assert reduced.n_components >= 2
+    assert distances.min() < 1e-12
 
 
 def test_a_light_component_far_away_does_not_set_the_scale() -> None:
-    one = GaussianMixture(
-        [0.5, 0.5 - 1e-9, 1e-9], [[0.0], [1.0], [40.0]], np.ones((3, 1, 1))
-    )
+    weights = [0.5, 0.5 - 1e-9, 1e-9]
+    one = GaussianMixture(weights, [[0.0], [1.0], [40.0]], np.ones((3, 1, 1)))
     two = GaussianMixture([0.5, 0.5], [[0.2], [1.3]], np.ones((2, 1, 1)))
+    # δ = 1e-9 · 760 is the least one, but the guards keep the others.
     assert merge_irrelevant(one, two, threshold=1.5).n_components == 3
 
 
 def test_pivoted_qr() -> None:
     means = np.array([[0.0, 0.0], [0.0, 1e-7], [5.0, 0.0], [5.0, 1e-7], [0.0, 9.0]])
-    shapes = ComponentShapes(means, np.stack([np.eye(2)] * 5), [0, 1, 2, 3, 4], 7)
+    # Two pairs of nearly equal columns and a column of its own: rank three.
+    covs = np.stack([np.eye(2)] * 5)
+    shapes = ComponentShapes(means, covs, [0, 1, 2, 3, 4], 7)
     dropped = pivoted_qr(shapes, n_components=3, rest="drop")
-    assert dropped.n_components == 3 and dropped.dropped == 7
+    assert dropped.n_components == 3
+    assert dropped.dropped == 7
     assert 4 in dropped.source
     merged = pivoted_qr(shapes, n_components=4)
     # Two copies, one of each pair, with equal weights.

@@ -15,7 +15,8 @@ from distfilt.models import LinearModel, Model, constant_velocity, simulate
 from distfilt.models.satellite import clohessy_wiltshire
 from tests.support import generator
 
-# Full, of several components, and without a symmetry that would hide a transposed factor.
+# Full, of several components, and without a symmetry that would hide a transposed
+# factor.
 FULL = np.array([[4.0, 1.2, -0.6], [1.2, 1.0, 0.3], [-0.6, 0.3, 0.5]])
 
 
@@ -38,6 +39,7 @@ def test_a_transition_that_works_in_place_does_not_change_the_caller_s_states() 
     # d(x + dt)/dx = I
     jacobian = model.jacobian(x, 0.0, 0.5)
     assert np.abs(jacobian - np.eye(2)).max() < 1e-9
+    # Two steps of 1 from the same start
     states = simulate(model, x, [1.0, 2.0], rng=generator())
     assert (states[0] == 2.0).all()
     assert (states[1] == 3.0).all()
@@ -69,8 +71,10 @@ def test_sampled_noise_has_the_full_covariance(method: str) -> None:
     cov = 0.5 * FULL
     # Var of an entry of the sample covariance: (P_ij² + P_ii P_jj)/n
     variances = cov.diagonal()
-    standard_error = np.sqrt((cov**2 + np.outer(variances, variances)) / n)
-    error = np.abs(samples.T @ samples / n - cov)
+    entry_variances = (cov**2 + np.outer(variances, variances)) / n
+    standard_error = np.sqrt(entry_variances)
+    sample_cov = samples.T @ samples / n
+    error = np.abs(sample_cov - cov)
     assert (error < 3.9 * standard_error).all()
 
 
@@ -89,6 +93,8 @@ def test_a_transposed_derivative_or_transition_matrix_is_warned_of_once(
     model = Model(
         2, exact.transition, exact.noise_cov, derivative=lambda x, t, dt: phi(dt)
     )
+    # Differences show a transposed derivative, and a transposed Φ violates
+    # Q(dt) = Φ(dt/2) Q(dt/2) Φ(dt/2)ᵀ + Q(dt/2).
     linear = LinearModel.from_transition(2, phi, exact.noise_cov)
     with warnings.catch_warnings(record=True, action="always") as messages:
         for _ in range(2):
@@ -132,6 +138,7 @@ def _bend(x: np.ndarray, t: float, dt: float) -> np.ndarray:
 
 
 def _bend_derivative(x: np.ndarray, t: float, dt: float) -> np.ndarray:
+    # (x_1, x_0; cos x_0, 0)
     jacobian = np.zeros((*x.shape, 2))
     jacobian[..., 0, 0] = x[..., 1]
     jacobian[..., 0, 1] = x[..., 0]
@@ -177,6 +184,7 @@ def test_a_transition_of_a_single_state_is_refused_for_many(
     transition: Any, shape: tuple[int, ...]
 ) -> None:
     """Also if there are as many states as components, so that the shape is right."""
+    # Each row of the result has to be the transition of that row alone.
     model = Model(4, transition, lambda t, dt: np.zeros((4, 4)))
     # A single state is fine.
     assert model.step(np.arange(4.0), 0.0, 0.1).shape == (4,)

@@ -13,6 +13,7 @@ from distfilt.models import constant_velocity, lorenz63, rk4
 
 @pytest.mark.parametrize("longest", [None, 0.5, 0.34])
 def test_rk4_is_batched_and_exact_for_cubics_in_time(longest: float | None) -> None:
+    # Without x in the rate the rule is Simpson's, which is exact up to degree three.
     x = np.zeros((3, 2))
     # The integral of 4 t³ from 1 to 2 is 2⁴ - 1⁴ = 15.
     result = rk4(lambda x, t: np.full_like(x, 4 * t**3), x, 1.0, 1.0, longest=longest)
@@ -57,7 +58,8 @@ BUFFER = np.empty(2)
 @pytest.mark.parametrize(
     "rate",
     [
-        # One array for all results; the states themselves; a copy of the changed states.
+        # One array for all results; the states themselves; a copy of the changed
+        # states.
         lambda x, t: np.multiply(x, -np.cos(t), out=BUFFER),
         lambda x, t: np.multiply(x, -np.cos(t), out=x),
         lambda x, t: np.multiply(x, -np.cos(t), out=x).copy(),
@@ -103,14 +105,17 @@ def test_names_and_units_of_straight_motion() -> None:
 def _lorenz_rate(t: float, states: np.ndarray) -> np.ndarray:
     """Lorenz's equations of twenty states in one vector, for scipy's integrator."""
     x, y, z = states.reshape(20, 3).T
-    rates = [10 * (y - x), x * (28 - z) - y, x * y - 8 / 3 * z]
-    return np.stack(rates, axis=-1).ravel()
+    x_rate = 10 * (y - x)
+    y_rate = x * (28 - z) - y
+    z_rate = x * y - 8 / 3 * z
+    return np.stack([x_rate, y_rate, z_rate], axis=-1).ravel()
 
 
 def test_lorenz_s_model_converges_to_an_adaptive_integrator() -> None:
     """From twenty states near the attractor, with the fourth power of the step."""
     rng = np.random.default_rng(0)
-    starts = np.array([1.5, -1.5, 25.5]) + rng.standard_normal((20, 3))
+    centre = np.array([1.5, -1.5, 25.5])
+    starts = centre + rng.standard_normal((20, 3))
     solution = solve_ivp(
         _lorenz_rate, (0, 1), starts.ravel(), method="DOP853", rtol=1e-13, atol=1e-13
     )
@@ -118,7 +123,8 @@ def test_lorenz_s_model_converges_to_an_adaptive_integrator() -> None:
     steps = np.array([0.01, 0.005, 0.0025, 0.00125])
     errors = []
     for h in steps:
-        difference = lorenz63(step=h).step(starts, 0.0, 1.0) - exact
+        result = lorenz63(step=h).step(starts, 0.0, 1.0)
+        difference = result - exact
         errors.append(np.sqrt((difference**2).mean()))
     assert errors[-1] < 1e-7
     # The order is the slope of the error in logarithmic scales.
@@ -128,5 +134,6 @@ def test_lorenz_s_model_converges_to_an_adaptive_integrator() -> None:
 
 def test_noise_of_lorenz_s_model() -> None:
     """σ² dt on each component, and none by default."""
-    assert np.allclose(lorenz63(sigma=0.5).Q(0.0, 0.1), 0.025 * np.eye(3))
+    noisy = lorenz63(sigma=0.5)
+    assert np.allclose(noisy.Q(0.0, 0.1), 0.025 * np.eye(3))
     assert not lorenz63().Q(0.0, 0.1).any()

@@ -51,9 +51,11 @@ def test_both_forms_are_the_pendulum_on_the_manifold(form: str) -> None:
     """A step in Cartesian coordinates is the step of the angle, mapped to them."""
     chart = np.random.default_rng(0).uniform(-3, 3, (50, 2))
     model = pendulum(length=1.3, form=form, step=0.001)
-    result = model.step(pendulum_states(chart, length=1.3), 0.0, 0.5)
+    states = pendulum_states(chart, length=1.3)
+    result = model.step(states, 0.0, 0.5)
     moved = pendulum_angle(length=1.3, step=0.001).step(chart, 0.0, 0.5)
-    assert np.abs(result - pendulum_states(moved, length=1.3)).max() < 1e-8
+    expected = pendulum_states(moved, length=1.3)
+    assert np.abs(result - expected).max() < 1e-8
 
 
 @pytest.mark.parametrize(
@@ -99,7 +101,8 @@ def test_the_chart_inverts_the_states() -> None:
 def test_noise_is_white_on_positions_and_velocities() -> None:
     """σ² dt, with one strength for positions and one for velocities; none by default."""
     model = pendulum(sigma=(0.1, 0.2))
-    assert np.allclose(model.Q(0.0, 0.5), np.diag([0.005, 0.005, 0.02, 0.02]))
+    expected = np.diag([0.005, 0.005, 0.02, 0.02])
+    assert np.allclose(model.Q(0.0, 0.5), expected)
     chart = pendulum_angle(sigma=(0.1, 0.2))
     assert np.allclose(chart.Q(0.0, 0.5), np.diag([0.005, 0.02]))
     assert (pendulum().Q(0.0, 0.1) == 0).all()

@@ -21,6 +21,7 @@ START = np.array([0.3, 0.2, 0.1, 1.0, 0.0, 0.0, 0.0])
 
 @given(st.floats(1e-3, 0.5), st.floats(0, 20))
 def test_transition_is_the_exponential_of_the_drift(rate: float, dt: float) -> None:
+    # Φ(dt) = exp(A dt) for the linear equations x' = A x.
     closed = satellite._transition_matrix(dt, rate)
     exponential = expm(satellite._drift(rate) * dt)
     assert np.allclose(closed, exponential, rtol=1e-9, atol=1e-9)
@@ -46,10 +47,12 @@ def test_noise_of_two_half_steps_is_that_of_a_whole_step() -> None:
     model = clohessy_wiltshire(rate=0.1, sigma=0.2)
     phi = model.F(0.05)
     q = model.Q(0.0, 0.05)
-    assert np.allclose(phi @ q @ phi.T + q, model.Q(0.0, 0.1), rtol=1e-12)
+    two_steps = phi @ q @ phi.T + q
+    assert np.allclose(two_steps, model.Q(0.0, 0.1), rtol=1e-12)
     # In a short step it is σ² dt.
     short = 1e-7
-    assert np.allclose(model.Q(0.0, short), 0.2**2 * short * np.eye(6), atol=1e-14)
+    expected = 0.2**2 * short * np.eye(6)
+    assert np.allclose(model.Q(0.0, short), expected, atol=1e-14)
 
 
 def _move_attitude(step: float, attitude: np.ndarray, dt: float) -> np.ndarray:
@@ -80,8 +83,9 @@ def test_the_attitude_is_integrated_at_the_order_of_runge_kutta() -> None:
     errors = [np.abs(end - exact).max() for end in ends]
     # |q| = 2 is conserved by (21), and not by the integrator.
     drifts = [abs(np.linalg.norm(end[3:]) - 2) for end in ends]
-    order, _ = np.polyfit(np.log(steps), np.log(errors), 1)
-    drift_order, _ = np.polyfit(np.log(steps), np.log(drifts), 1)
+    log_steps = np.log(steps)
+    order, _ = np.polyfit(log_steps, np.log(errors), 1)
+    drift_order, _ = np.polyfit(log_steps, np.log(drifts), 1)
     assert abs(order - 4) < 0.15
     assert drift_order > 3.85
 
@@ -111,4 +115,6 @@ def test_noise_of_the_pose() -> None:
     orbit = clohessy_wiltshire(rate=0.1, sigma=0.2)
     assert np.allclose(q[:6, :6], orbit.Q(0.0, 0.1))
     assert not q[:6, 6:].any()
-    assert np.allclose(q[6:, 6:], np.diag([0.004] * 3 + [0.0] * 4))
+    # 0.2² · 0.1 = 0.004 on each angular velocity
+    expected = np.diag([0.004] * 3 + [0.0] * 4)
+    assert np.allclose(q[6:, 6:], expected)

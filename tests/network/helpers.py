@@ -48,6 +48,7 @@ def random_graph(seed: int, agents: int, *, directed: bool = False) -> Graph:
     """Return a graph that has each link with probability one half."""
     links = rng(seed).random((agents, agents)) < 0.5
     upper = np.triu(links, 1)
+    # An undirected graph has the links of the upper triangle in both directions.
     lower = np.tril(links, -1) if directed else upper.T
     return Graph.from_adjacency((upper | lower).astype(float), directed=directed)
 
@@ -67,8 +68,11 @@ def gaussians(seed: int, *leading: int, d: int = 2) -> tuple[np.ndarray, np.ndar
     draw = rng(seed)
     factors = draw.standard_normal((*leading, d, d))
     scale = np.logspace(-1, 1, d)
-    covs = factors @ np.swapaxes(factors, -1, -2) + 0.2 * np.eye(d)
+    # S (F Fᵀ + 0.2 I) S with S = diag(scale) is positive definite.
+    covs = factors @ np.swapaxes(factors, -1, -2)
+    covs = covs + 0.2 * np.eye(d)
     covs = covs * np.outer(scale, scale)
+    # Products are rounded differently in both triangles.
     covs = 0.5 * (covs + np.swapaxes(covs, -1, -2))
     means = draw.standard_normal((*leading, d)) * scale
     return means, covs

@@ -59,6 +59,7 @@ def test_only_arrays_are_sent(payload: object) -> None:
     channel = star()
     with pytest.raises(ValueError, match=r"^payloads\[2\] must"):
         channel.broadcast([np.zeros(1), None, payload])
+    # A refused round leaves no trace in the ledger, although two payloads are valid.
     assert channel.ledger.rounds == 0
     assert has_counts(channel, messages=0)
 
@@ -66,8 +67,9 @@ def test_only_arrays_are_sent(payload: object) -> None:
 def test_payloads_have_the_axes_of_the_runs() -> None:
     channel = star(runs=(4,))
     text = r"^payloads\[0\] must have leading axes \(4,\)"
+    payload = (np.zeros((4, 3)), np.zeros(3))
     with pytest.raises(ValueError, match=text):
-        channel.broadcast([(np.zeros((4, 3)), np.zeros(3))] * 3)
+        channel.broadcast([payload] * 3)
     assert has_counts(channel, messages=0)
 
 
@@ -78,6 +80,7 @@ def test_a_ledger_is_replaced_and_never_changed() -> None:
     channel.mix(_ZERO, weights.metropolis(STAR))
     assert before.rounds == 0
     assert (before.messages == 0).all()
+    # Two rounds of a star with four directed links, one float64 on each.
     expected = "Ledger(rounds=2, messages=8, scalars=8, bytes=64, lost=0)"
     assert repr(channel.ledger) == expected
 
@@ -165,6 +168,7 @@ def test_every_number_is_charged_and_missing_ones_are_not_sent(name: str) -> Non
     assert has_counts(channel, messages=messages, scalars=scalars, bytes=bytes_, lost=0)
     assert channel.ledger.rounds == 1
     for agent, inbox in enumerate(inboxes):
+        # A payload of NaN alone is no message: its receivers find no entry.
         senders = [j for j in STAR.neighbours(agent) if messages[j]]
         assert list(inbox) == senders
         for sender, received in inbox.items():
@@ -183,12 +187,15 @@ def _check_same_payload(received: object, sent: object) -> None:
 
 def test_received_arrays_are_read_only_and_plain() -> None:
     values = [np.array([float(agent)]) for agent in range(3)]
-    received = [
-        star().broadcast(values)[1][0],
-        star().broadcast([(values[0], values[1]), None, None])[1][0][1],
-        lossy(0.5, runs=(20,)).broadcast([np.ones((20, 2))] * 3)[0][1],
-    ]
-    for array in received:
+    # An array, an item of a tuple, and an array with lost runs.
+    inboxes = star().broadcast(values)
+    plain = inboxes[1][0]
+    inboxes = star().broadcast([(values[0], values[1]), None, None])
+    item = inboxes[1][0][1]
+    batch = [np.ones((20, 2))] * 3
+    inboxes = lossy(0.5, runs=(20,)).broadcast(batch)
+    with_losses = inboxes[0][1]
+    for array in (plain, item, with_losses):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 9.0
     # The sender can go on with its own array.
@@ -217,16 +224,19 @@ def test_mix_is_the_matrix_product(seed: int, agents: int, k: int, rounds: int) 
     """Every link is charged once a round."""
     draw = rng(seed)
     graph = random_graph(seed, agents, directed=True)
+    # Weights are any numbers here, on the links and on the diagonal alone.
     pattern = graph.links.toarray() + np.eye(agents)
     w = draw.standard_normal((agents, agents)) * pattern
     values = draw.standard_normal((2, agents, k))
     channel = Channel(graph, runs=(2,))
     mixed = channel.mix(values, weights_of_matrix(graph, w), rounds=rounds)
+    # W^k x for k rounds.
     expected = np.linalg.matrix_power(w, rounds) @ values
     assert np.allclose(mixed, expected, rtol=1e-12, atol=1e-10)
     assert channel.ledger.rounds == rounds * (graph.senders.size > 0)
     sent = rounds * graph.out_degree
-    assert has_counts(channel, messages=sent, scalars=k * sent, bytes=8 * k * sent)
+    scalars = k * sent
+    assert has_counts(channel, messages=sent, scalars=scalars, bytes=8 * scalars)
 
 
 @each_graph
@@ -250,9 +260,11 @@ def test_mix_and_send_on_links_are_broadcast_to_the_bit(
         # A message that no run has received is in no inbox, and NaN on its link.
         nothing = np.full((*runs, 3), NAN)
         for link, receiver in enumerate(graph.receivers):
-            received = inboxes[receiver].get(int(graph.senders[link]), nothing)
+            sender = int(graph.senders[link])
+            received = inboxes[receiver].get(sender, nothing)
             assert np.array_equal(on_links[..., link, :], received, equal_nan=True)
         for agent, inbox in enumerate(inboxes):
+            # The order of a sum decides its last bit.
             total = dense[agent, agent] * values[..., agent, :]
             for sender, payload in inbox.items():
                 term = dense[agent, sender] * payload
@@ -268,6 +280,7 @@ def test_only_the_links_in_use_are_charged() -> None:
     channel = star()
     used = np.array([True, False, False, True])
     received = channel.send_on_links(np.arange(4.0)[:, None], links=used)
+    # An unused link delivers NaN, as a lost message does.
     expected = [0.0, NAN, NAN, 3.0]
     assert np.array_equal(received.ravel(), expected, equal_nan=True)
     messages = np.bincount(STAR.senders[used], minlength=3)
@@ -288,6 +301,7 @@ def test_rules_for_losses_by_their_definition(on_loss: str) -> None:
     w = weights.metropolis(GRID)
     dense = w.matrix.toarray()
     arrived = arrivals(faults, GRID)[0]
+    # A message counts for "mutual" and "metropolis" if its answer arrived, too.
     both_ways = arrived & arrived.T
     degree = both_ways.sum(axis=1)
     expected = np.empty_like(values)
@@ -302,7 +316,8 @@ def test_rules_for_losses_by_their_definition(on_loss: str) -> None:
         }[on_loss]
         # The own value gets the remainder of one, except where lost weights go nowhere.
         self_weight = dense[i, i] if on_loss == "zero" else 1 - row.sum()
-        expected[i] = self_weight * values[i] + row @ values
+        received_sum = row @ values
+        expected[i] = self_weight * values[i] + received_sum
     mixed = Channel(GRID, faults=faults).mix(values, w, on_loss=on_loss)
     assert np.abs(mixed - expected).max() < 1e-14
 
@@ -318,9 +333,14 @@ def test_rules_that_need_acknowledgements_refuse_one_way_links() -> None:
 
 def test_losses_in_a_batch_are_counted_on_average() -> None:
     channel = lossy(0.5, runs=(8,))
-    inbox = channel.broadcast([np.ones((8, 1))] * 3)[0]
+    payloads = [np.ones((8, 1))] * 3
+    inbox = channel.broadcast(payloads)[0]
     nothing = np.full((8, 1), NAN)
-    lost = [np.isnan(inbox.get(sender, nothing)).mean() for sender in (1, 2)]
+    lost = []
+    for sender in (1, 2):
+        received = inbox.get(sender, nothing)
+        lost.append(np.isnan(received).mean())
+    # Charges are those of one run, so that the count is the fraction of lost runs.
     assert (channel.ledger.lost[1:] == lost).all()
     assert 0 < channel.ledger.lost.sum() < 4
 
@@ -357,6 +377,7 @@ def test_acknowledgements_are_charged_to_the_receiver() -> None:
 def test_late_values_are_those_of_the_round_of_sending(delay: int) -> None:
     """Own values are present. A message on its way does not change, and losses are of its round."""
     graph = REFERENCE["ring"]
+    # W = I + adjacency: a mixed value less the own one is the sum of the received ones.
     w = weights_of_matrix(graph, np.eye(7) + graph.links.toarray())
     prompt, late = (
         Channel(graph, faults=Faults(loss=0.5, seed=3, delay=d)) for d in (0, delay)
@@ -370,6 +391,7 @@ def test_late_values_are_those_of_the_round_of_sending(delay: int) -> None:
         received = sums[k - delay] if k >= delay else 0.0
         mixed = late.mix(values, w, on_loss="zero")
         assert np.allclose(mixed, values + received, atol=1e-12)
+    # A message is charged when it is sent, not when it arrives.
     assert have_equal_counts(prompt, late)
 
 
@@ -389,6 +411,8 @@ def test_delayed_averaging_still_agrees_but_on_another_value() -> None:
     channel = Channel(w.graph, faults=Faults(delay=1))
     mixed = channel.mix(values, w, on_loss="keep", rounds=400)
     assert np.ptp(mixed) < 1e-9
+    # Σ (1 + 1 - w_ii) x_i is conserved: agent i's value is held once by itself and,
+    # with the weight 1 - w_ii, by the messages on their way.
     count = 1 + (1 - w.self_weights)
     limit = count @ values[:, 0] / count.sum()
     assert abs(mixed[0, 0] - limit) < 1e-9
@@ -398,6 +422,7 @@ def test_delayed_averaging_still_agrees_but_on_another_value() -> None:
 def test_silent_agents_neither_send_nor_receive() -> None:
     channel = star(faults=Faults(silent=[1]))
     inboxes = channel.broadcast(_ONES)
+    # The star's leaf 1 is silent: the centre and leaf 2 exchange their values.
     assert [sorted(inbox) for inbox in inboxes] == [[2], [], [0]]
     assert has_counts(channel, messages=[1, 0, 1], lost=0)
 
@@ -415,6 +440,7 @@ def test_windows_follow_the_channel_s_time(make: type[Channel]) -> None:
 
 def test_windows_follow_the_ledger_s_rounds_without_a_time() -> None:
     channel = star(faults=Faults(loss=1.0, during=[(1, 3), (4, 5)]))
+    # Rounds 1, 2 and 4 are inside the windows [1, 3) and [4, 5).
     counts = [len(channel.broadcast(_ONES)[0]) for _ in range(6)]
     assert counts == [2, 0, 0, 2, 0, 2]
     # The count goes on with the ledger, in another channel.

@@ -52,6 +52,7 @@ def test_averaging_is_steps_against_the_laplacian(
     expected = values
     for _ in range(3):
         expected = expected - gain * graph.laplacian.toarray() @ expected
+    # An unstable gain makes values grow: errors are relative to the largest one.
     scale = max(1.0, np.abs(averaged).max())
     assert np.abs(averaged - expected).max() < 1e-12 * scale
 
@@ -62,8 +63,10 @@ def test_a_gain_beyond_the_bound_warns_once_with_both_numbers() -> None:
     text = r"^gain must be at most 2/λ_max = 0\.666667.* got 0\.7"
     with pytest.warns(UnstableGain, match=text) as caught:
         averaged = network.average_consensus(values, star(), gain=0.7, rounds=200)
+    # One warning for all 200 rounds, at the line of the caller.
     assert len(caught) == 1
     assert caught[0].filename == __file__
+    # λ_max = 3: the mode of this eigenvalue grows by |1 - 0.7 · 3| = 1.1 a round.
     assert np.abs(averaged - values.mean()).max() > 100
 
 
@@ -75,8 +78,10 @@ def test_the_warning_s_edge_and_its_cost(graph: Graph) -> None:
     values = np.zeros((graph.n_agents, 1))
     average = partial(network.average_consensus, values, Channel(graph))
     average(gain=0.99 * graph.degree_bound_gain)
+    # The bound from degrees is at most 2/λ_max and needs no spectrum.
     assert "max_stable_gain" not in vars(graph)
     assert "laplacian_spectrum" not in vars(graph)
+    # The exact edge is 2/λ_max: no warning just below it, one just above.
     average(gain=graph.max_stable_gain * (1 - 1e-6))
     with pytest.warns(UnstableGain):
         average(gain=graph.max_stable_gain * (1 + 1e-6))
@@ -90,10 +95,15 @@ def test_mutual_rules_keep_the_average_under_loss(
     values = rng(seed).standard_normal((2, DISK.n_agents, 2))
     channel = Channel(DISK, runs=(2,), faults=Faults(loss=loss, seed=seed))
     averaged = network.average_consensus(values, channel, rounds=5, on_loss=on_loss)
-    assert np.abs(averaged.mean(axis=-2) - values.mean(axis=-2)).max() < 1e-12
+    # Both ends of a link use it or neither does, so that the weights stay symmetric:
+    # 1ᵀ W = 1ᵀ.
+    error = averaged.mean(axis=-2) - values.mean(axis=-2)
+    assert np.abs(error).max() < 1e-12
     # With few losses the values come closer, too.
     if loss <= 0.5:
-        assert (np.ptp(averaged, axis=-2) < np.ptp(values, axis=-2)).all()
+        range_before = np.ptp(values, axis=-2)
+        range_after = np.ptp(averaged, axis=-2)
+        assert (range_after < range_before).all()
 
 
 def test_averaging_on_a_disconnected_graph_warns() -> None:
@@ -102,6 +112,7 @@ def test_averaging_on_a_disconnected_graph_warns() -> None:
     values = np.array([[0.0], [2.0], [7.0]])
     with pytest.warns(Disconnected, match="got 2 components") as caught:
         averaged = network.average_consensus(values, Channel(graph), rounds=60)
+    # (0 + 2) / 2 = 1 for the pair; the single agent keeps its 7.
     assert np.allclose(averaged, [[1.0], [1.0], [7.0]])
     assert len(caught) == 1
     assert caught[0].filename == __file__
@@ -116,9 +127,12 @@ def test_finite_time_is_exact(graph: Graph) -> None:
     values = rng(4).standard_normal((2, graph.n_agents, 2))
     channel = Channel(graph, runs=(2,))
     averaged = network.finite_time_consensus(values, channel)
-    error = np.abs(averaged - values.mean(axis=-2, keepdims=True)).max()
+    mean = values.mean(axis=-2, keepdims=True)
+    error = np.abs(averaged - mean).max()
     # The disk graph has thirty different eigenvalues, which cost digits.
     assert error < (1e-9 if graph is DISK else 1e-12)
+    # Π (I - L/λ) over the distinct eigenvalues λ > 0 removes every mode but the mean:
+    # one round for each of them.
     distinct = np.unique(graph.laplacian_spectrum.round(9))
     assert channel.ledger.rounds == len(distinct) - 1
 
@@ -131,7 +145,11 @@ def test_finite_time_on_many_eigenvalues_needs_leja_s_order() -> None:
 
 
 def test_finite_time_needs_every_message() -> None:
-    cases = ((lossy(), "channel must have no faults"), (Channel(UNLINKED), "connected"))
+    # A loss leaves a factor I - L/λ incomplete; without links nothing is averaged.
+    cases = (
+        (lossy(), "channel must have no faults"),
+        (Channel(UNLINKED), "connected"),
+    )
     for channel, text in cases:
         with pytest.raises(ValueError, match=text):
             network.finite_time_consensus(np.zeros((3, 1)), channel)
@@ -140,7 +158,9 @@ def test_finite_time_needs_every_message() -> None:
 @pytest.mark.parametrize("scale", [1.0, 1e3])
 def test_eigenvalues_count_once_at_any_scale(scale: float) -> None:
     values = scale * np.array([1.0, 1.0 + 1e-12, 2.0, 3.0, 3.0])
-    assert np.allclose(_drop_repeated(values), scale * np.array([1.0, 2.0, 3.0]))
+    # Copies differ by 1e-12 of the value, which is rounding; 1e-6 is a difference.
+    expected = scale * np.array([1.0, 2.0, 3.0])
+    assert np.allclose(_drop_repeated(values), expected)
     assert _drop_repeated(np.array([1.0, 1.0 + 1e-6])).size == 2
 
 
@@ -155,6 +175,7 @@ def test_push_sum_reaches_the_average_through_heavy_loss(
     values = 2.16 + rng(2).standard_normal((graph.n_agents, 1))
     channel = lossy(loss, graph)
     averaged = network.push_sum(values, channel, rounds=900)
+    # Running sums: the next message that arrives makes up for the lost ones.
     assert np.abs(averaged - values.mean()).max() < 1e-10
     # Value and weight on each link and round.
     assert (channel.ledger.scalars == 2 * 900 * graph.out_degree).all()
@@ -166,9 +187,12 @@ def test_averages_on_a_digraph() -> None:
     values = rng(2).standard_normal((5, 4, 2))
     doubly_stochastic = weights.doubly_stochastic(graph)
     average = partial(network.average_consensus, weights=doubly_stochastic)
+    mean = values.mean(axis=1, keepdims=True)
+    # Push-sum needs columns that sum to one; plain averaging needs rows, too.
     for rule in (network.push_sum, average):
         averaged = rule(values, Channel(graph, runs=(5,)), rounds=400)
-        assert np.abs(averaged - values.mean(axis=1, keepdims=True)).max() < 1e-12
+        error = np.abs(averaged - mean).max()
+        assert error < 1e-12
 
 
 @each_graph
@@ -176,6 +200,7 @@ def test_the_maximum_needs_the_diameter(graph: Graph) -> None:
     values = rng(4).standard_normal((graph.n_agents, 2))
     channel = Channel(graph)
     largest = values.max(axis=0)
+    # A value travels one hop a round, and the farthest agent is a diameter away.
     assert (network.max_consensus(values, channel) == largest).all()
     assert channel.ledger.rounds == graph.diameter
     # Losses cost time alone.
@@ -191,6 +216,7 @@ _ZERO = np.zeros((3, 2))
 
 
 def _local_solve(target: np.ndarray, rho: float) -> np.ndarray:
+    # argmin_u |u - c|² / 2 + ρ |u - target|² / 2
     return (_CENTRES + rho * target) / (1 + rho)
 
 
@@ -200,9 +226,11 @@ def _residuals(rho: float, iterations: int) -> list[tuple[float, float]]:
     w = _ZERO
     residuals = []
     for _ in range(iterations):
+        # u_l = argmin f_l + ρ/2 |u - z + w_l|², z⁺ = mean(u + w), w⁺ = w + u - z⁺
         u = _local_solve(z - w, rho)
         new = _ZERO + (u + w).mean(axis=0)
         w = w + u - new
+        # Primal residual u - z⁺, dual residual ρ (z⁺ - z).
         primal = float(np.abs(u - new).max())
         dual = float(rho * np.abs(new - z).max())
         residuals.append((primal, dual))
@@ -226,7 +254,9 @@ def test_admm_stops_once_both_residuals_are_below_the_tolerance(rho: float) -> N
     assert result.iterations == first
     residuals = (result.primal, result.dual)
     assert np.allclose(residuals, series[first - 1], rtol=1e-6, atol=1e-12)
-    assert np.abs(result.common - _CENTRES.mean(axis=0)).max() < 1e-3
+    # The minimiser of the sum is the mean of the centres.
+    minimiser = _CENTRES.mean(axis=0)
+    assert np.abs(result.common - minimiser).max() < 1e-3
     # Two rounds for the average of 2 numbers and two for the maximum of 2, in each
     # iteration.
     assert channel.ledger.rounds == 2 * first + 2 * first
@@ -235,6 +265,7 @@ def test_admm_stops_once_both_residuals_are_below_the_tolerance(rho: float) -> N
 
 
 def test_admm_reports_residuals_and_needs_every_message() -> None:
+    # Two iterations are too few for the tolerance: the error names both residuals.
     primal, dual = _residuals(1.0, 2)[-1]
     text = f"{primal:.3g} and {dual:.3g} after 2 iterations"
     with pytest.raises(SolverError, match=text):
@@ -271,7 +302,9 @@ def test_the_agents_order_does_not_matter(name: str) -> None:
     """With other numbers the same agents reach the same values and send as much."""
     values = rng(1).standard_normal((GRID.n_agents, 2))
     order = rng(2).permutation(GRID.n_agents)
-    permuted = Graph.from_adjacency(GRID.links.toarray()[np.ix_(order, order)])
+    # P L Pᵀ for a permutation P: rules commute with renumbering.
+    links = GRID.links.toarray()
+    permuted = Graph.from_adjacency(links[np.ix_(order, order)])
     channel = Channel(GRID)
     other = Channel(permuted)
     result = RULES[name](values, channel)

@@ -19,8 +19,10 @@ def _series(faults: Faults, graph: Graph, rounds: int, runs: int) -> np.ndarray:
 
 def _is_plausible(events: np.ndarray, cases: np.ndarray, probability: float) -> bool:
     """Return whether a count of events among cases lies in its 99.9% binomial band."""
-    low, high = binom.ppf([5e-4, 1 - 5e-4], int(cases.sum()), probability)
-    return bool(low <= (events & cases).sum() <= high)
+    n_cases = int(cases.sum())
+    n_events = (events & cases).sum()
+    low, high = binom.ppf([5e-4, 1 - 5e-4], n_cases, probability)
+    return bool(low <= n_events <= high)
 
 
 @pytest.mark.parametrize("burst_length", [None, 6.0, 30.0])
@@ -45,6 +47,7 @@ def test_stored_losses_stay() -> None:
     mask = 2**64 - 1
 
     def mix(z: int) -> int:
+        # The finaliser of splitmix64.
         z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & mask
         z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & mask
         return z ^ (z >> 31)
@@ -56,8 +59,12 @@ def test_stored_losses_stay() -> None:
         key = mix((seed + golden * (round_ + 1)) & mask)
         run_bits = mix(key ^ (run * golden & mask))
         for link in range(4):
-            number = int(STAR.receivers[link]) * 3 + int(STAR.senders[link])
+            # The number of a link is that of its entry in the adjacency matrix.
+            receiver = int(STAR.receivers[link])
+            sender = int(STAR.senders[link])
+            number = receiver * 3 + sender
             bits = mix(run_bits ^ mix(number + golden))
+            # The upper 53 bits are a float in [0, 1).
             uniform = (bits >> 11) * 2.0**-53
             assert lost[run, link] == (uniform < 0.4)
 
@@ -89,6 +96,8 @@ def test_each_round_of_a_burst_follows_from_the_one_before() -> None:
     """
     loss = 0.2
     burst_length = 8.0
+    # P(lost | lost before) = p + q = 1 - 1/b and P(lost | arrived before) = p; the rate
+    # r is stationary: r = p + q r.
     stay = 1 - 1 / (burst_length * (1 - loss))
     enter = loss * (1 - stay)
     bursts = Faults(loss=loss, burst_length=burst_length, seed=6)
@@ -98,6 +107,7 @@ def test_each_round_of_a_burst_follows_from_the_one_before() -> None:
     expected = below_p[1:] | (below_p_plus_q[1:] & lost[:-1])
     assert (lost[1:] == expected).all()
     # The first round lies between the two.
+    # p <= r <= p + q, as r is the stationary rate.
     assert (lost[0] >= below_p[0]).all()
     assert (lost[0] <= below_p_plus_q[0]).all()
     assert lost[0].any()
@@ -106,6 +116,7 @@ def test_each_round_of_a_burst_follows_from_the_one_before() -> None:
 @given(st.integers(0, 1000), st.floats(0, 1), st.floats(1, 50))
 def test_bursts_of_any_rate_end(seed: int, loss: float, burst_length: float) -> None:
     """The search for the round that decides always stops, also near rates 0 and 1."""
+    # Independent losses of rate r have bursts of mean length 1 / (1 - r).
     shortest = 1 / (1 - loss) if 0 < loss < 1 else 1.0
     if burst_length < shortest * (1 - 1e-8):
         with pytest.raises(ValueError, match="^burst_length must be at least"):
@@ -124,7 +135,10 @@ def test_loss_by_receiver_and_by_link() -> None:
     by_link[0, 2] = 1.0
     by_link[1, 0] = 1.0
     # Agent 0 receives from 1 and 2, they from it.
-    cases = ((by_receiver, [[], [0], [0]]), (by_link, [[1], [], [0]]))
+    cases = (
+        (by_receiver, [[], [0], [0]]),
+        (by_link, [[1], [], [0]]),
+    )
     for loss, senders in cases:
         channel = Channel(STAR, faults=Faults(loss=loss, seed=1))
         inboxes = channel.broadcast([np.zeros(1)] * 3)
@@ -141,7 +155,8 @@ def test_windows_hold_losses_and_silence() -> None:
     assert off == [2 * flag for flag in active]
     # With a time the windows are in seconds: closed on the left, open on the right.
     timed = Faults(loss=1.0, during=[(0.5, 1.0)])
-    lost = [bool(timed.draw_losses(STAR, 9, 1, t).all()) for t in (0.4, 0.5, 1.0)]
+    times = (0.4, 0.5, 1.0)
+    lost = [bool(timed.draw_losses(STAR, 9, 1, t).all()) for t in times]
     assert lost == [False, True, False]
 
 
@@ -149,10 +164,12 @@ def test_faults_together_fail_in_every_way() -> None:
     a = Faults(loss=0.3, seed=1)
     b = Faults(loss=0.4, seed=2, during=[(0, 5)], delay=1)
     c = Faults(silent=[2], delay=2)
-    by_a, by_b = (x.draw_losses(STAR, 3, 9) for x in (a, b))
+    by_a = a.draw_losses(STAR, 3, 9)
+    by_b = b.draw_losses(STAR, 3, 9)
     # In any grouping.
     for faults in (a | b | c, a | (b | c)):
         assert (faults.draw_losses(STAR, 3, 9) == (by_a | by_b)).all()
+        # Outside the window of b only a loses messages; delays add up.
         later = a.draw_losses(STAR, 6, 9)
         assert (faults.draw_losses(STAR, 6, 9) == later).all()
         assert (faults.active_links(STAR) == c.active_links(STAR)).all()

@@ -28,7 +28,9 @@ def test_all_agents_know_all_values_in_the_end(graph: Graph) -> None:
 def test_one_round_reaches_the_neighbours(graph: Graph) -> None:
     values = rng(1).standard_normal((graph.n_agents, 2))
     average, known = network.flooding(values, Channel(graph), rounds=1)
-    expected = graph.links.toarray().astype(bool) | np.eye(graph.n_agents, dtype=bool)
+    # Each agent knows its own value and those of its neighbours.
+    linked = graph.links.toarray().astype(bool)
+    expected = linked | np.eye(graph.n_agents, dtype=bool)
     assert (known == expected).all()
     means = [values[row].mean(axis=0) for row in expected]
     assert np.allclose(average, means)

@@ -18,6 +18,7 @@ def test_two_agents_change_in_each_round(graph: Graph) -> None:
     for _ in range(30):
         channel = Channel(graph)
         averaged = network.gossip_consensus(values, channel, rounds=1, rng=draw)
+        # All other agents keep their values to the bit.
         pair = np.flatnonzero((averaged != values).any(axis=1))
         assert pair.size == 2
         assert pair[1] in graph.neighbours(int(pair[0]))
@@ -37,6 +38,7 @@ def test_gossip_converges_to_the_average(graph: Graph) -> None:
     averaged = network.gossip_consensus(values, channel, rounds=4000, rng=rng(5))
     mean = values.mean(axis=0)
     assert np.abs(averaged - mean).max() < 1e-6
+    # (x_i + x_j) / 2 twice has the sum x_i + x_j: exact but for rounding.
     assert np.abs(averaged.mean(axis=0) - mean).max() < 1e-13
 
 
@@ -49,10 +51,12 @@ def test_pairs_are_drawn_evenly() -> None:
     draw = rng(8)
     for _ in range(rounds):
         channel = Channel(graph)
+        # Values are all different, so that the lower end of the pair names the link.
         averaged = network.gossip_consensus(values, channel, rounds=1, rng=draw)
         counts[np.flatnonzero(averaged != values)[0]] += 1
     # An end has one neighbour, which it always chooses; an inner agent has two.
-    expected = rounds * np.array([1 + 0.5, 0.5 + 0.5, 0.5 + 1]) / 4
+    probabilities = np.array([1 + 0.5, 0.5 + 0.5, 0.5 + 1]) / 4
+    expected = rounds * probabilities
     assert chisquare(counts, expected).pvalue > 1e-3
 
 
@@ -60,7 +64,9 @@ def test_gossip_through_losses_keeps_the_average() -> None:
     values = rng(1).standard_normal((6, GRID.n_agents, 1))
     channel = Channel(GRID, runs=(6,), faults=Faults(loss=0.4, seed=2))
     averaged = network.gossip_consensus(values, channel, rounds=1500, rng=rng(3))
-    assert np.abs(averaged.mean(axis=1) - values.mean(axis=1)).max() < 1e-13
+    # A pair changes only if both messages arrive: no half of an exchange is applied.
+    error = averaged.mean(axis=1) - values.mean(axis=1)
+    assert np.abs(error).max() < 1e-13
     width = np.ptp(averaged, axis=1)
     assert (width > 0).all()
     assert width.max() < 1e-3

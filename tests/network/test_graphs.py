@@ -43,6 +43,7 @@ def test_shapes_and_spectra_are_networkx_s(name: str) -> None:
     if graph.n_agents > 1:
         spectrum = np.sort(nx.laplacian_spectrum(reference))
         assert np.allclose(graph.laplacian_spectrum, spectrum, atol=1e-10)
+        # |1 - γ λ| < 1 for all modes needs γ < 2/λ_max.
         gain = 2 / graph.laplacian_spectrum[-1]
         assert np.isclose(graph.max_stable_gain, gain, rtol=1e-9)
 
@@ -60,11 +61,14 @@ def test_links_and_laplacian_by_their_definition(
     graph = random_graph(seed, agents, directed=directed)
     dense = graph.links.toarray()
     degrees = dense.sum(axis=1)
-    assert (graph.laplacian.toarray() == np.diag(degrees) - dense).all()
+    # L = D - A with the in-degrees: links[i, j] leads from j to i.
+    laplacian = np.diag(degrees) - dense
+    assert (graph.laplacian.toarray() == laplacian).all()
     assert (graph.in_degree == degrees).all()
     assert (graph.out_degree == dense.sum(axis=0)).all()
     # Each row of the incidence matrix counts the links that end at its agent.
-    assert (graph.incidence @ np.ones(graph.senders.size) == degrees).all()
+    ones = np.ones(graph.senders.size)
+    assert (graph.incidence @ ones == degrees).all()
     for agent in range(agents):
         assert graph.neighbours(agent) == tuple(np.flatnonzero(dense[agent]))
     if not graph.is_directed:
@@ -95,9 +99,11 @@ def test_a_gain_from_degrees_is_stable(seed: int, agents: int, directed: bool) -
     graph = random_graph(seed, agents, directed=directed)
     bound = graph.degree_bound_gain
     limit = graph.max_stable_gain
+    # Degrees bound the eigenvalues: by Merris, for a digraph by Gershgorin's discs.
     assert bound <= limit * (1 + 1e-9)
     assert graph.senders.size or bound == limit == float("inf")
     eigenvalues = np.linalg.eigvals(graph.laplacian.toarray())
+    # Modes of eigenvalue zero are the averages of the components.
     moving = eigenvalues[np.abs(eigenvalues) > 1e-8]
     if moving.size:
         # A mode of eigenvalue λ is multiplied by 1 - γ λ in each round.
@@ -106,6 +112,8 @@ def test_a_gain_from_degrees_is_stable(seed: int, agents: int, directed: bool) -
 
 
 def test_the_degree_bound_is_exact_for_stars_and_even_rings() -> None:
+    # λ_max = max (d_i + m_i) with the neighbours' mean degree m_i: 7 for a star of 7
+    # (6 + 1), 4 for an even ring (2 + 2).
     for graph in (graphs.star(7), graphs.ring(8), graphs.ring(10_000)):
         assert np.isclose(graph.degree_bound_gain, graph.max_stable_gain, rtol=1e-12)
 
@@ -122,7 +130,8 @@ def test_disk_links_are_the_close_pairs(seed: int, agents: int, radius: float) -
 def test_edges_count_once_and_run_from_sender_to_receiver() -> None:
     repeated = [(0, 1), (1, 0), (2, 1), (1, 2), (0, 1)]
     for edges in ([(0, 1), (1, 2)], repeated):
-        assert (Graph.from_edges(3, edges).links != graphs.path(3).links).nnz == 0
+        graph = Graph.from_edges(3, edges)
+        assert (graph.links != graphs.path(3).links).nnz == 0
     # Agent 2 receives from nobody.
     one_way = Graph.from_edges(3, [(0, 1), (1, 2)], directed=True)
     assert one_way.is_directed
@@ -141,7 +150,8 @@ def test_graphs_of_networkx_keep_their_labels_or_their_order() -> None:
     assert Graph.from_networkx(parallel).senders.size == 4
     # Labels that are numbers, or names of agents, count before the order.
     for a, b, c in ((0, 1, 2), "abc"):
-        assert as_graph(nx.Graph([(c, a), (a, b)]), 3, "abc").neighbours(0) == (1, 2)
+        graph = as_graph(nx.Graph([(c, a), (a, b)]), 3, "abc")
+        assert graph.neighbours(0) == (1, 2)
     expected = r"graph must have the nodes \['a', 'b', 'c'\], got"
     with pytest.raises(ValueError, match=expected):
         as_graph(nx.path_graph(["a", "b", "d"]), 3, "abc")
@@ -158,6 +168,7 @@ def test_a_graph_of_networkx_without_nodes_is_refused() -> None:
 def test_a_graph_from_each_of_its_descriptions(seed: int, agents: int) -> None:
     graph = random_graph(seed, agents)
     dense = graph.links.toarray()
+    # Of an undirected graph each edge once, so that the upper triangle lists them all.
     edges = np.argwhere(np.triu(dense))
     descriptions = [
         graph,
@@ -177,10 +188,12 @@ def test_a_graph_from_each_of_its_descriptions(seed: int, agents: int) -> None:
 
 
 def test_two_edges_are_no_matrix_of_two_agents() -> None:
+    # [[0, 1], [1, 0]] could be an adjacency matrix or two edges.
     assert as_graph([(0, 1), (1, 0)]).n_agents == 2
     assert as_graph([(0, 1), (1, 2)]).n_agents == 3
     # With three agents (0, 1) and (1, 0) are edges, and the third has no links.
-    assert as_graph([(0, 1), (1, 0)], 3).in_degree.tolist() == [1.0, 1.0, 0.0]
+    graph = as_graph([(0, 1), (1, 0)], 3)
+    assert graph.in_degree.tolist() == [1.0, 1.0, 0.0]
 
 
 def test_wrong_descriptions_are_refused_with_the_way_to_mend_them() -> None:

@@ -25,6 +25,8 @@ def test_the_lag_behind_a_ramp(rate: float, lag: float) -> None:
         inputs = start + 0.1 * k
         state = network.pi_step(state, inputs, channel, dt=0.1, rate=slope, **GAINS)
         ledger = channel.ledger
+    # The consensus terms cancel in the mean, whose error follows e' = -α e + 1, or
+    # e' = -α e with the rate: the limits are 1/α and 0.
     error = start.mean() + 100.0 - state.estimate.mean()
     assert abs(error - lag) < (1e-6 if lag else 1e-10)
 
@@ -53,8 +55,9 @@ def test_a_step_of_substeps_by_its_equations(with_rate: bool) -> None:
         expected_nu = expected_nu + h * derivative
     channel = Channel(GRID)
     rate = slope if with_rate else None
-    state = network.PIState(nu, eta)
-    state = network.pi_step(state, u, channel, dt=dt, rate=rate, substeps=n, **GAINS)
+    start = network.PIState(nu, eta)
+    options = {"dt": dt, "rate": rate, "substeps": n}
+    state = network.pi_step(start, u, channel, **options, **GAINS)
     assert np.abs(state.estimate - expected_nu).max() < 1e-13
     assert np.abs(state.integral - expected_eta).max() < 1e-13
     # Estimates and integrals of two components on each link and substep.
@@ -77,4 +80,5 @@ def test_substeps_are_half_as_long_as_the_bound(
     """2 / (α + a λ), or (α + a λ) / (b λ)² where 2 b λ exceeds that, with λ twice the degree."""
     alpha, a, b = gains
     number = network.stable_substeps(Channel(graph), dt, alpha=alpha, a=a, b=b)
+    # Substeps of half the bound: Δ / n <= limit / 2.
     assert number == np.ceil(2 * dt / limit)

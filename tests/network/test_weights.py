@@ -20,6 +20,7 @@ def _second_modulus(w: ConsensusWeights) -> float:
 @each_graph
 def test_metropolis_weights_by_their_definition(graph: Graph) -> None:
     degree = graph.in_degree
+    # w_ij = 1 / (1 + max(d_i, d_j))
     larger = np.maximum(degree[graph.receivers], degree[graph.senders])
     w = weights.metropolis(graph)
     assert (w.link_weights == 1 / (1 + larger)).all()
@@ -32,6 +33,7 @@ def test_gossip_weights_are_the_mean_over_all_pairs(graph: Graph) -> None:
     mean = np.zeros((n_agents, n_agents))
     for i in range(n_agents):
         for j in graph.neighbours(i):
+            # The matrix of one exchange: both ends take their mean.
             pair = np.eye(n_agents)
             pair[np.ix_([i, j], [i, j])] = 0.5
             # Agent i wakes with probability 1/A and chooses each neighbour alike.
@@ -52,6 +54,7 @@ def _check_symmetric_and_stochastic(w: ConsensusWeights) -> None:
 def test_column_stochastic_weights_of_a_digraph(seed: int, agents: int) -> None:
     graph = random_graph(seed, agents, directed=True)
     columns = weights.column_stochastic(graph).matrix.toarray().sum(axis=0)
+    # 1ᵀ W = 1ᵀ: the sum of all values is conserved.
     assert np.abs(columns - 1).max() < 1e-12
 
 
@@ -59,6 +62,7 @@ def test_column_stochastic_weights_of_a_digraph(seed: int, agents: int) -> None:
 def test_doubly_stochastic_weights_of_a_digraph(seed: int, agents: int) -> None:
     graph = random_graph(seed, agents, directed=True)
     if not graph.is_connected:
+        # Positive weights on all links exist only where each link lies on a cycle.
         with pytest.raises(ValueError, match="strongly"):
             weights.doubly_stochastic(graph)
         return
@@ -70,7 +74,8 @@ def test_doubly_stochastic_weights_of_a_digraph(seed: int, agents: int) -> None:
     assert (of_links > 0).all()
     assert np.isclose(dense.diagonal().min(), 0.5)
     # Proportional to the left null vector, here from a dense decomposition.
-    p = np.abs(np.linalg.svd(graph.laplacian.T.toarray())[2][-1])
+    _, _, right_vectors = np.linalg.svd(graph.laplacian.T.toarray())
+    p = np.abs(right_vectors[-1])
     ratio = of_links / p[graph.receivers]
     assert np.ptp(ratio) < 1e-9 * ratio.max()
 
@@ -96,6 +101,7 @@ def test_doubly_stochastic_weights_of_a_long_ring_lose_no_digits() -> None:
     forward = np.stack([agents, np.roll(agents, -1)], axis=1)
     edges = np.concatenate([forward, forward[:1250, ::-1]])
     graph = Graph.from_edges(2500, edges, directed=True)
+    # Stationary weights span many orders of magnitude along the ring.
     columns = weights.doubly_stochastic(graph).matrix.sum(axis=0)
     assert np.abs(np.asarray(columns) - 1).max() < 1e-12
 
@@ -106,7 +112,8 @@ def test_the_best_constant_reaches_its_bound(graph: Graph) -> None:
     w = weights.best_constant_edge(graph)
     low = graph.laplacian_spectrum[1]
     high = graph.laplacian_spectrum[-1]
-    assert np.isclose(_second_modulus(w), (high - low) / (high + low), atol=1e-9)
+    bound = (high - low) / (high + low)
+    assert np.isclose(_second_modulus(w), bound, atol=1e-9)
     assert (weights.best_constant_edge(graphs.path(1)).matrix.toarray() == 1).all()
 
 
@@ -118,8 +125,8 @@ def test_the_fastest_weights_reach_the_convex_optimum(graph: Graph) -> None:
     dense = w.matrix.toarray()
     assert (dense == dense.T).all()
     assert np.abs(dense.sum(axis=0) - 1).max() < 1e-12
-    # Minimise the norm of I - B diag(x) Bᵀ - 11ᵀ/A with the oriented incidence matrix
-    # B.
+    # Minimise the norm of I - B diag(x) Bᵀ - 11ᵀ/A with the oriented incidence
+    # matrix B.
     forward = np.flatnonzero(graph.receivers < graph.senders)
     numbers = range(forward.size)
     incidence = np.zeros((graph.n_agents, forward.size))
@@ -127,10 +134,13 @@ def test_the_fastest_weights_reach_the_convex_optimum(graph: Graph) -> None:
     incidence[graph.senders[forward], numbers] = -1
     x = cp.Variable(forward.size)
     laplacian = incidence @ cp.diag(x) @ incidence.T
-    matrix = np.eye(graph.n_agents) - laplacian - 1 / graph.n_agents
-    optimum = cp.Problem(cp.Minimize(cp.norm(matrix, 2))).solve()
+    averaging = np.full((graph.n_agents, graph.n_agents), 1 / graph.n_agents)
+    matrix = np.eye(graph.n_agents) - averaging - laplacian
+    objective = cp.Minimize(cp.norm(matrix, 2))
+    optimum = cp.Problem(objective).solve()
     modulus = _second_modulus(w)
     assert optimum - 1e-5 < modulus < optimum + 1e-3
+    # Equal weights are feasible, so that they cannot be better.
     best_constant = _second_modulus(weights.best_constant_edge(graph))
     assert modulus <= best_constant + 1e-12
 
@@ -148,4 +158,5 @@ def test_columns_are_checked_relative_to_the_terms_that_cancel() -> None:
         w = ConsensusWeights(STAR, self_weights, link_weights)
         with pytest.raises(ValueError, match=f"columns that sum to{text}"):
             weights._check_keeps_average(w)
+    # Terms of more than 1e7 cancel to 1: only relative to them is the rounding small.
     weights._check_keeps_average(weights._laplacian_weights(DISK, 1e7 / 3))

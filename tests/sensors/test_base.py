@@ -21,6 +21,7 @@ FULL = np.array([[4.0, 1.2, -0.6], [1.2, 1.0, 0.3], [-0.6, 0.3, 0.5]])
 @given(st.floats(-50, 50), st.integers(-5, 5))
 def test_wrap_forgets_whole_turns(value: float, turns: int) -> None:
     once = wrap([value])
+    # Equal on the circle: near its ends rounding may put one at π and the other at -π.
     turned = wrap([value + turns * 2 * np.pi])
     assert abs(wrap(once - turned)[0]) < 1e-9
     assert -np.pi <= once[0] < np.pi
@@ -53,7 +54,8 @@ def test_wrap_at_its_ends(period: float) -> None:
     # Idempotent, exact for tiny angles, NaN stays.
     assert (wrap(wrapped, period=period) == wrapped).all()
     assert wrap(1e-300, period=period) == 1e-300
-    assert np.array_equal(wrap([NAN, 0.1], period=period), [NAN, 0.1], equal_nan=True)
+    with_nan = wrap([NAN, 0.1], period=period)
+    assert np.array_equal(with_nan, [NAN, 0.1], equal_nan=True)
 
 
 @pytest.mark.parametrize(
@@ -96,10 +98,13 @@ def test_observations_have_the_full_covariance() -> None:
     noise = sensor.observe(np.full((n, 3), 7.0), rng=generator(1)) - 7.0
     # The variance of a sample covariance's entry is (R_ij² + R_ii R_jj) / n.
     variances = FULL.diagonal()
-    error = np.sqrt((FULL**2 + np.outer(variances, variances)) / n)
+    entry_variances = (FULL**2 + np.outer(variances, variances)) / n
+    error = np.sqrt(entry_variances)
     sample_cov = noise.T @ noise / n
     assert (np.abs(sample_cov - FULL) < 3.9 * error).all()
-    assert (np.abs(noise.mean(axis=0)) < 3.9 * np.sqrt(variances / n)).all()
+    # The variance of a mean is R_ii / n.
+    mean_error = np.sqrt(variances / n)
+    assert (np.abs(noise.mean(axis=0)) < 3.9 * mean_error).all()
 
 
 def test_residual_keeps_nan_of_either_argument() -> None:
@@ -108,7 +113,8 @@ def test_residual_keeps_nan_of_either_argument() -> None:
     assert np.isnan(residual[0, :2]).all()
     assert residual[0, 2] == 2.0
     # Also of a residual that wraps.
-    wrapped = bearing([0, 1], std=0.1).residual([[NAN], [1.0]], [[1.0], [NAN]])
+    angle = bearing([0, 1], std=0.1)
+    wrapped = angle.residual([[NAN], [1.0]], [[1.0], [NAN]])
     assert np.isnan(wrapped).all()
 
 
@@ -138,7 +144,10 @@ def test_a_transposed_derivative_warns_and_a_rough_one_does_not() -> None:
     cases = ((1.0, 1.05 * turn, 0), (1.0, turn.T, 1), (1e-9, turn, 0))
     for value, slope, count in cases:
         sensor = Sensor(
-            2, lambda x: np.abs(x) @ turn.T, np.eye(2), derivative=lambda x, s=slope: s
+            2,
+            lambda x: np.abs(x) @ turn.T,
+            np.eye(2),
+            derivative=lambda x, s=slope: s,
         )
         with warnings.catch_warnings(record=True, action="always") as caught:
             sensor.jacobian(np.full((3, 2), value))

@@ -39,14 +39,18 @@ def test_an_angle_s_residual_is_the_short_way(y: float, p: float) -> None:
     The residual is at most half a period, and k times it is the angle from p to y.
     """
     for sensor, k in ((bearing, 1), (line_angle, 2)):
-        residual = sensor([0, 1], std=0.1).residual([y / k], [p / k])[0]
+        angle = sensor([0, 1], std=0.1)
+        residual = angle.residual([y / k], [p / k])[0]
         assert abs(residual) <= np.pi / k
-        assert abs(np.exp(1j * (y - p)) - np.exp(1j * k * residual)) < 1e-9
+        # Angles are equal on the circle if exp(i a) are.
+        difference = np.exp(1j * (y - p))
+        assert abs(difference - np.exp(1j * k * residual)) < 1e-9
 
 
 @pytest.mark.parametrize("sensor", [bearing, line_angle])
 def test_the_angle_at_its_origin_is_missing(sensor: Callable[..., Sensor]) -> None:
     """NaN in prediction, residual and derivative, for that state only."""
+    # The first state is at the sensor, the second one is not.
     x = np.array([[*PLACE, 1.0], [1.0, 1.0, 1.0]])
     angle = sensor([0, 1], std=0.1, origin=PLACE)
     predicted = angle.predict(x)
@@ -77,8 +81,11 @@ def test_components_and_increments_by_their_definition() -> None:
     # H picks rows of the identity.
     assert np.array_equal(plain.H(3), np.eye(3)[[2, 0]])
     change = increment([2, 0], std=0.3)
-    assert np.array_equal(change.predict(X, previous), (X - previous)[:, [2, 0]])
-    assert (change.jacobian(X, previous) == np.eye(3)[[2, 0]]).all()
+    expected = (X - previous)[:, [2, 0]]
+    assert np.array_equal(change.predict(X, previous), expected)
+    # ∂(x - p)/∂x is H, too.
+    slope = change.jacobian(X, previous)
+    assert (slope == np.eye(3)[[2, 0]]).all()
     # One previous state for many present ones, or the reverse.
     assert change.jacobian(X[0], previous).shape == (2, 2, 3)
 
@@ -143,6 +150,7 @@ def test_jacobians_are_the_derivatives(sensor: Sensor) -> None:
     """Against central differences with a step of the test's own."""
     x = generator(1).standard_normal((3, 4, 6))
     slope = sensor.jacobian(x)
+    # Differences of predictions are residuals, which wrap.
     numeric = central_difference(sensor.predict, x, sensor.residual, step=2e-5)
     assert slope.shape == (3, 4, sensor.dim, 6)
     assert np.abs(slope - numeric).max() < 1e-7
@@ -152,7 +160,7 @@ def test_jacobians_are_the_derivatives(sensor: Sensor) -> None:
 def test_shipped_sensors_can_be_pickled(sensor: Sensor) -> None:
     """The copy predicts, compares and errs alike."""
     copy = pickle.loads(pickle.dumps(sensor))
-    x, previous = generator(2).standard_normal((2, 4, 6)) * 1e5
+    x, previous = 1e5 * generator(2).standard_normal((2, 4, 6))
     states = (x, previous) if sensor.uses_previous else (x,)
     predicted = sensor.predict(*states)
     assert np.array_equal(copy.predict(*states), predicted, equal_nan=True)
@@ -179,7 +187,8 @@ def test_a_stacked_sensor_is_its_parts() -> None:
     assert np.abs(stacked.residual(turned, predictions)).max() < 1e-12
     # Linear if all parts are.
     assert stacked.linear is None
-    assert (stack([component([0], std=0.5), linear]).H(3) == np.eye(3)).all()
+    linear_stack = stack([component([0], std=0.5), linear])
+    assert (linear_stack.H(3) == np.eye(3)).all()
 
 
 def test_a_robot_measures_from_its_own_pose() -> None:
@@ -190,17 +199,21 @@ def test_a_robot_measures_from_its_own_pose() -> None:
         heading = state[4]
         robot = range_bearing([0, 1], std=[0.1, 0.1], origin=place, heading=heading)
         length, angle = robot.predict(state)
-        direction = np.array([np.cos(angle + heading), np.sin(angle + heading)])
+        # target = place + length · (cos(angle + heading), sin(angle + heading))
+        absolute = angle + heading
+        direction = np.array([np.cos(absolute), np.sin(absolute)])
         assert np.allclose(place + length * direction, target, atol=1e-12)
 
 
 def test_angles_point_at_the_target() -> None:
     """The unit vector of right ascension and declination, times the distance."""
     rng = np.random.default_rng(0)
-    x = rng.standard_normal((30, 12)) * 1e4
+    x = 1e4 * rng.standard_normal((30, 12))
     sight = x[:, :3] - x[:, 6:9]
     a, d = angles_only(std=1e-4).predict(x).T
-    unit = np.stack([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)], axis=-1)
+    towards_x = np.cos(d) * np.cos(a)
+    towards_y = np.cos(d) * np.sin(a)
+    unit = np.stack([towards_x, towards_y, np.sin(d)], axis=-1)
     length = np.linalg.norm(sight, axis=1, keepdims=True)
     assert np.allclose(unit * length, sight)
 
@@ -215,6 +228,7 @@ def test_the_printed_form_loses_a_sign_and_the_right_one_wraps() -> None:
     assert np.allclose(printed.predict(front), printed.predict(back))
     right = angles_only(std=1.0)
     assert not np.allclose(right.predict(front), right.predict(back))
+    # From -π + 0.1 to π - 0.1 the short way is -0.2.
     residual = right.residual([np.pi - 0.1, 0.2], [-np.pi + 0.1, 0.1])
     assert np.allclose(residual, [-0.2, 0.1])
 
@@ -225,10 +239,13 @@ def test_the_observer_s_place_in_the_state_and_the_ephemeris() -> None:
     # The same positions, the observer's where it is by default.
     y = x[:12].copy()
     y[6:9] = x[12:15]
-    assert np.allclose(telescope.predict(x), angles_only(std=1.0).predict(y))
+    expected = angles_only(std=1.0).predict(y)
+    assert np.allclose(telescope.predict(x), expected)
+    # An ephemeris is the position and velocity of the first satellite.
     fix = ephemeris(position_std=1e-3, velocity_std=1e-5)
     assert fix.predict(x).tolist() == x[:6].tolist()
-    assert np.allclose(np.sqrt(np.diag(fix.noise_cov)), [1e-3] * 3 + [1e-5] * 3)
+    std = np.sqrt(np.diag(fix.noise_cov))
+    assert np.allclose(std, [1e-3] * 3 + [1e-5] * 3)
 
 
 @pytest.mark.parametrize(
@@ -260,6 +277,7 @@ def test_an_angle_by_its_name_has_two_components(kind: str) -> None:
 def test_a_hidden_direction_is_nan() -> None:
     """The observer of the first state is behind the Earth, that of the second is not."""
     x = np.zeros((2, 12))
+    # Positions of targets and observers in km
     x[:, 0] = 26000.0
     x[0, 6] = -42000.0
     x[1, 7] = 42000.0

@@ -60,11 +60,13 @@ class Recorder:
         recorded = self.calls.setdefault(key, [])
         if len(recorded) < MAX_CALLS:
             with suppress(Exception):
+                # An argument that cannot be copied (an open file, a lock) is left out.
                 recorded.append(copy.deepcopy((args, options)))
 
     @contextmanager
     def patch_validation(self) -> Iterator[None]:
         """Record every validated call inside the context."""
+        # The originals, restored at the end
         validate = decorators.SignatureConstraints.validate
         post_init = FrozenModel.__post_init__
 
@@ -76,6 +78,7 @@ class Recorder:
                 self.record(plan.function, args, options)
             return checked
 
+        # A model's own check may change its fields: record them as they were given.
         def construct_and_record(model: Any) -> None:
             values = {f.name: getattr(model, f.name) for f in fields(model)}
             post_init(model)
@@ -104,6 +107,7 @@ def public_names(subpackage: str) -> dict[str, Any]:
     """Return a subpackage's exports, and those of the modules among them, by name."""
     package = importlib.import_module(f"distfilt.{subpackage}")
     names: dict[str, Any] = {}
+    # Modules among the exports count with their own exports.
     for name in getattr(package, "__all__", ()):
         value = getattr(package, name)
         if isinstance(value, ModuleType):
@@ -119,8 +123,10 @@ def callables(thing: Any) -> dict[str, Callable[..., Any]]:
     members: dict[str, Callable[..., Any]] = {"": thing} if describe(thing) else {}
     if not inspect.isclass(thing):
         return members
+    # From the base to the class itself, so that an overriding method wins.
     for base in reversed(thing.__mro__):
         for name, attribute in vars(base).items():
+            # A class method or static method wraps its function.
             function = getattr(attribute, "__func__", attribute)
             if not name.startswith("_") and describe(function):
                 members[f".{name}"] = function
@@ -145,6 +151,7 @@ def _modules(thing: Any) -> Iterator[ModuleType]:
     home = sys.modules[thing.__module__]
     yield home
     subpackage = home.__name__.split(".")[1]
+    # Examples of the same subpackage most likely call it: they come first.
     packages = pkgutil.walk_packages(distfilt.__path__, "distfilt.")
     names = [info.name for info in packages]
     for name in sorted(names, key=lambda n: (n.split(".")[1] != subpackage, n)):
@@ -160,6 +167,7 @@ def calls(thing: Any, function: Callable[..., Any]) -> list[Call]:
     )  # type: ignore[attr-defined]
     for module in _modules(thing):
         _run_examples(module)
+        # Running more examples would take time and add nothing.
         if RECORDER.calls.get(key):
             break
     recorded = RECORDER.calls.get(key, [])
@@ -170,9 +178,11 @@ def _bind(function: Any, args: Any, options: Any) -> Call:
     """Return a recorded call with its arguments by name."""
     signature = inspect.signature(function)
     if inspect.isclass(function) and is_dataclass(function):
+        # Fields that the constructor does not take are computed by the class.
         accepted = {f.name for f in fields(function) if f.init}
         arguments = {n: v for n, v in options.items() if n in accepted}
         return Call(function, signature, arguments)
     bound = signature.bind(*args, **options)
+    # Defaults are arguments too: they are exchanged like any other.
     bound.apply_defaults()
     return Call(function, signature, dict(bound.arguments))

@@ -33,7 +33,9 @@ import numpy as np
 from tests.tools.calls import Call, callables, calls, public_names, subpackages
 
 ROOT = Path(__file__).resolve().parents[2]
+# The errors of the library; anything else is an accident, such as a KeyError inside.
 REFUSALS = (ValueError, RuntimeError, LookupError, ImportError, FileNotFoundError)
+# A call that takes longer counts as "too long".
 SECONDS = 10
 
 
@@ -77,16 +79,21 @@ def array_kinds(value: Any) -> Iterator[tuple[str, Any]]:
     a = np.array(value)
     f = np.array(value, dtype=float)
     with np.errstate(all="ignore"):
+        # Equivalent forms of an array: its numbers are the same in each.
         if a.dtype.kind == "f":
             frozen = a.copy()
             frozen.flags.writeable = False
+            # Every second entry of a wider array: memory with gaps
             wide = np.repeat(a, 2, axis=-1)[..., ::2] if a.ndim else a
             yield from (("list", a.tolist()), ("fortran", np.asfortranarray(a)))
             yield from (("read-only", frozen), ("strided", wide))
+        # The first entry is masked; a function that ignored it would use a wrong
+        # number.
         masked = np.ma.masked_array(f.copy(), np.arange(f.size).reshape(f.shape) == 0)
         yield from (("complex", f + 1j), ("dates", np.zeros(a.shape, "datetime64[s]")))
         yield from (("text", a.astype(str)), ("masked", masked), ("dict", {"a": 1.0}))
         yield from (("booleans", np.ones(a.shape, bool)), ("object", object()))
+        # One bad entry among good ones is the hardest to see.
         for name, bad in (("NaN", np.nan), ("infinite", np.inf)):
             one = f.copy()
             one.flat[-1] = bad
@@ -115,6 +122,7 @@ def number_kinds(value: Any) -> Iterator[tuple[str, Any]]:
         ("object", object()),
         ("dict", {"a": 1}),
     )
+    # bool is an int: without this, True would be exchanged by numbers.
     if isinstance(value, bool | np.bool_):
         return
     if isinstance(value, int | np.integer):
@@ -141,6 +149,7 @@ def number_kinds(value: Any) -> Iterator[tuple[str, Any]]:
 
 def other_kinds(value: Any) -> Iterator[tuple[str, Any]]:
     yield from (("number", 3.5), ("object", object()))
+    # A function is exchanged by a text, a text by another one.
     if callable(value) and not inspect.isclass(value):
         yield "text", "text"
     elif isinstance(value, str | os.PathLike):
@@ -189,6 +198,7 @@ def parts(
     value: Any, depth: int = 0, visited: frozenset[int] = frozenset()
 ) -> Iterator[Any]:
     """Yield the numbers, texts and arrays that a result holds, in order."""
+    # Objects may refer to each other in a circle.
     if depth > 8 or id(value) in visited:
         return
     if value is None or isinstance(value, PLAIN):
@@ -218,6 +228,7 @@ def equal(x: Any, y: Any) -> bool:
     if x.shape != y.shape:
         return False
     if x.dtype.kind in "fc" and y.dtype.kind in "fciu":
+        # Small entries of an array carry the rounding of the largest one.
         scale = np.nanmax(np.abs(x[np.isfinite(x)]), initial=1.0)
         return bool(np.allclose(x, y, rtol=1e-9, atol=1e-9 * scale, equal_nan=True))
     return bool((x == y).all()) if x.dtype.kind != "O" else True
@@ -248,6 +259,7 @@ def time_limit(seconds: int) -> Iterator[None]:
     def stop(*_: Any) -> None:
         raise TooLong
 
+    # An alarm interrupts loops of Python; no thread has to be ended.
     before = signal.signal(signal.SIGALRM, stop)
     signal.alarm(seconds)
     try:
@@ -266,6 +278,7 @@ def names_argument(error: Exception, call: Call, argument: str, kind: str) -> bo
     text = str(error)
     names = {argument}
     if kind not in NEVER:
+        # "the covariance of x: ..." names a quantity that was computed.
         computed = re.match(r"[\w .\[\]]+: ", text)
         if computed or isinstance(error, np.linalg.LinAlgError):
             return True
@@ -287,6 +300,7 @@ def exchange(
 ) -> Finding:
     """Run a call with one argument exchanged, and classify the outcome."""
     _, argument, kind = where
+    # A copy from before the call shows whether the call changed its arguments.
     before = copy.deepcopy(call.arguments) | {argument: copy.deepcopy(value)}
     try:
         with time_limit(SECONDS), warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -294,11 +308,13 @@ def exchange(
             result, after = call.run(**{argument: value})
     except TooLong:
         return Finding(*where, "too long")
+    # A huge size is refused by the system.
     except MemoryError:
         return Finding(*where, "rejected", "memory")
     except Exception as error:
         outcome = classify_error(error, call, argument, kind)
         return Finding(*where, outcome, f"{type(error).__name__}: {error}"[:200])
+    # A generator is meant to change.
     for name in set(before) - {"rng", "self", "cls"}:
         if not exact(before[name], after.get(name)):
             return Finding(*where, "changed", name)
@@ -306,6 +322,7 @@ def exchange(
         return Finding(*where, "same" if same(reference, result) else "different")
     if kind in NEVER:
         return Finding(*where, "accepted", type(result).__name__)
+    # NaN that the valid call returns too is no fault.
     return Finding(
         *where, "NaN" if nan_count(result) > nan_count(reference) else "finite"
     )
@@ -322,9 +339,12 @@ def fuzz_calls(name: str, valid_calls: list[Call]) -> Iterator[Finding]:
             continue
         for argument, valid in call.arguments.items():
             parameter = call.signature.parameters[argument]
+            # Kinds 2 and 4 are *args and **kwargs.
             if argument in ("self", "cls") or parameter.kind in (2, 4):
                 continue
             for kind, value in kinds(valid):
+                # A second call with the same type of argument would repeat the
+                # exchange.
                 key = argument, kind, type(valid)
                 is_default = value is None and parameter.default is None
                 if key not in tried and not is_default:
@@ -375,6 +395,7 @@ def judge(finding: Finding) -> str:
     if finding.result not in GOOD:
         for patterns in ALLOWED:
             pairs = zip(patterns, names, strict=True)
+            # All three patterns have to fit the finding.
             if all(re.fullmatch(pattern, name) for pattern, name in pairs):
                 return "allowed"
     return finding.result
@@ -385,6 +406,7 @@ def run(chosen: list[str]) -> list[Finding]:
     folder = Path.cwd()
     findings: list[Finding] = []
     with tempfile.TemporaryDirectory(prefix="fuzz-") as scratch:
+        # Functions that write files get paths such as "no such".
         os.chdir(scratch)
         try:
             for subpackage in chosen:

@@ -78,6 +78,7 @@ def mutants(root: Path, only: str) -> Iterator[Mutant]:
     from cosmic_ray.plugins import get_operator, operator_names
 
     kinds = {name: get_operator(name) for name in sorted(operator_names())}
+    # Operators with parameters need values that only a user can give.
     plain = {name: kind() for name, kind in kinds.items() if not kind.arguments()}
     for path in sorted((root / "distfilt").rglob("*.py")):
         module = path.relative_to(root).as_posix()
@@ -88,6 +89,7 @@ def mutants(root: Path, only: str) -> Iterator[Mutant]:
             places = (
                 place for node in nodes for place in operator.mutation_positions(node)
             )
+            # cosmic-ray makes its k-th change of an operator in a module.
             for occurrence, (start, _) in enumerate(places):
                 yield Mutant(module, name, occurrence, *start)
 
@@ -96,6 +98,7 @@ def meaning(text: str) -> str:
     """Return a module's syntax tree without types and docstrings, as text."""
     tree = ast.parse(text)
     for node in ast.walk(tree):
+        # A mutant that changes types or texts only cannot be detected by a test.
         for name in ("annotation", "returns"):
             if hasattr(node, name):
                 setattr(node, name, None)
@@ -115,6 +118,7 @@ def keys(places: list[tuple[str, int, int]], root: Path, seed: int) -> dict[Any,
         if module not in lines:
             lines[module] = (root / module).read_text(encoding="utf-8").splitlines()
         text = f"{seed} {module} {lines[module][line - 1].strip()} {column}"
+        # Equal lines of a module are told apart by a count.
         counts[text] += 1
         hashes[module, line, column] = sha256(
             f"{text} {counts[text]}".encode()
@@ -131,6 +135,7 @@ def draw_sample(root: Path, size: int, seed: int, only: str) -> list[Mutant]:
         )
     numbers = keys(list(places), root, seed)
     sample: list[Mutant] = []
+    # In the order of their random numbers: a larger sample contains the smaller one.
     for place in sorted(places, key=numbers.__getitem__):
         if len(sample) == size:
             break
@@ -148,6 +153,8 @@ def nearest(module: str, root: Path) -> list[str]:
     """Return the tests of the first stage: examples, the module's test file, validation."""
     parts = Path(module).with_suffix("").parts[1:]
     name = f"test_{parts[-1].lstrip('_')}.py"
+    # distfilt/network/graphs.py has tests/network/test_graphs.py, or
+    # tests/test_network.py.
     mirrors = [
         root.joinpath("tests", *parts[:-1], name),
         root / "tests" / f"test_{parts[0]}.py",
@@ -178,6 +185,7 @@ def trace_tests(root: Path, jobs: int) -> Any:
                 "--dist",
                 "loadscope",
                 "--cov=distfilt",
+                # The context of a line is the test that runs it.
                 "--cov-context=test",
                 "--cov-report=",
                 *EVERY,
@@ -201,6 +209,7 @@ def running(contexts: dict[int, list[str]], text: str, line: int) -> list[str]:
     """Return the tests that run a line's statement, else its function, else its module."""
     nodes = [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.stmt)]
     spans = [(n.lineno, n.end_lineno or n.lineno) for n in nodes]
+    # From the innermost statement outwards to the whole module
     enclosing = [(a, b) for a, b in spans if a <= line <= b]
     for first, last in (
         *sorted(enclosing, key=lambda s: s[1] - s[0]),
@@ -226,6 +235,7 @@ def passes(tests: list[str], folder: Path, seconds: float) -> bool:
         "no:cacheprovider",
         *tests,
     ]
+    # A session of its own, so that all its processes can be ended together.
     child = subprocess.Popen(
         command,
         cwd=folder,
@@ -236,6 +246,7 @@ def passes(tests: list[str], folder: Path, seconds: float) -> bool:
         env=os.environ | {"PYTHONPATH": str(folder), "HYPOTHESIS_PROFILE": "gate"},
     )
     try:
+        # A mutant may loop for ever: too long counts as detected.
         return child.wait(seconds) in (0, 5)  # 5: no test there
     except subprocess.TimeoutExpired:
         return False
@@ -264,6 +275,7 @@ def run_mutant(
     mutant: Mutant, stages: list[list[str]], free: SimpleQueue[Path]
 ) -> dict[str, Any]:
     """Test one mutant in a free copy of the repository; return its result."""
+    # Each job waits for a copy that no other job uses.
     folder = free.get()
     path = folder / mutant.module
     text = path.read_text(encoding="utf-8")
@@ -273,10 +285,12 @@ def run_mutant(
     try:
         for stage, names in enumerate(stages, start=1):
             result["stage"] = stage
+            # The second stage runs only if the first one finds nothing.
             if names and not passes(names, folder, SECONDS[stage - 1]):
                 result["result"] = "killed"
                 break
     finally:
+        # The copy serves the next mutant.
         path.write_text(text, encoding="utf-8")
         free.put(folder)
     return result | {"seconds": f"{time.perf_counter() - started:.0f}"}
@@ -285,6 +299,7 @@ def run_mutant(
 def stages(mutant: Mutant, root: Path, trace: Any) -> list[list[str]]:
     """Return the tests of both stages."""
     path = root / mutant.module
+    # Which tests run which line of the module
     lines = trace.contexts_by_lineno(str(path))
     text = path.read_text(encoding="utf-8")
     return [nearest(mutant.module, root), running(lines, text, mutant.line)]
@@ -304,6 +319,7 @@ def run(
         ThreadPoolExecutor(jobs) as pool,
     ):
         for k in range(jobs):
+            # A copy for each job: a mutant changes the source that its tests import.
             free.put(shutil.copytree(root, Path(scratch) / str(k), ignore=left_out))
         waiting = {
             pool.submit(run_mutant, m, stages(m, root, trace), free): row
@@ -357,11 +373,13 @@ def main(
     pairs = []
     for mutant in chosen:
         row = describe(mutant, root)
+        # A mutant that ran before keeps its result and the reason written by hand.
         old = earlier.get((row["module"], row["was"], row["becomes"]), {})
         pairs.append((mutant, row | {n: old[n] for n in COLUMNS[4:] if n in old}))
     waiting = [(m, row) for m, row in pairs if not row["result"]]
     rows = [row for _, row in pairs]
     end = time.monotonic() + 60 * options.minutes
+    # The table is complete at any time, so that a run may be interrupted.
     write_table(rows, table)
     for _ in run(waiting, root, options.jobs) if waiting else ():
         write_table(rows, table)
@@ -370,6 +388,7 @@ def main(
     ran = [row for row in rows if row["result"]]
     killed = sum(row["result"] == "killed" for row in ran)
     equivalent = sum(row["result"] == "survived" and bool(row["reason"]) for row in ran)
+    # An equivalent mutant behaves as the original, so that no test can detect it.
     share = killed / max(len(ran) - equivalent, 1)
     print(
         f"{killed} of {len(ran)} killed, {equivalent} equivalent: {share:.1%} of the other mutants"

@@ -42,6 +42,7 @@ def return_annotations() -> str:
 
 def unused_names(code: str) -> list[str]:
     """Return the public callables of the library whose names `code` does not contain."""
+    # The last part of a name is enough: `filters.run` is used as `run`.
     words = set(re.findall(r"\w+", code))
     unused = []
     for subpackage in subpackages():

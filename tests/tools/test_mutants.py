@@ -47,6 +47,7 @@ def repository(tmp_path: Path) -> Path:
 
 
 def test_changes_of_types_and_docstrings_are_not_drawn(repository: Path) -> None:
+    # Other types and texts, the same behaviour
     same = LIBRARY.replace("int | None", "int & None").replace("Half.", "Whole.")
     assert mutants.meaning(same) == mutants.meaning(LIBRARY)
     assert mutants.meaning(
@@ -61,6 +62,7 @@ def test_a_sample_depends_on_the_seed_and_has_one_change_a_position(
     repository: Path,
 ) -> None:
     sample = mutants.draw_sample(repository, 50, 3, "")
+    # Reproducible; a smaller sample is the beginning of a larger one.
     assert sample == mutants.draw_sample(repository, 50, 3, "") and len(sample) >= 4
     assert len({(m.line, m.column) for m in sample}) == len(sample)
     assert mutants.draw_sample(repository, 2, 3, "") == sample[:2]
@@ -70,6 +72,7 @@ def test_a_sample_depends_on_the_seed_and_has_one_change_a_position(
 def test_tests_of_a_line_run_its_statement_or_function_or_module() -> None:
     text = "A = (\n    1\n)\n\ndef f(x,\n      y=2):\n    z = (x +\n         y)\n    return z\n"
     # Lines and the tests that run them; '' is the import.
+    # As coverage stores them: TEST|PHASE, with the parameters of the test in brackets
     contexts = {
         1: [""],
         5: [""],
@@ -88,6 +91,7 @@ def run(repository: Path, table: Path, *options: str) -> str:
     """Run the tool in a separate process, on that repository."""
     call = f"import mutants; from pathlib import Path; mutants.main({['--jobs', '2', *options]}, "
     call += f"Path({str(repository)!r}), Path({str(table)!r}))"
+    # The process imports the tool by its name.
     tools = Path(mutants.__file__).parent
     return subprocess.run(
         [sys.executable, "-c", call],
@@ -103,6 +107,7 @@ def test_mutants_are_killed_or_survive_and_a_run_continues(
     repository: Path, tmp_path: Path
 ) -> None:
     table = tmp_path / "out" / "mutants.csv"
+    # With no time at all one mutant still runs, so that every call gets on.
     assert "of 1 killed" in run(
         repository, table, "--jobs", "1", "--sample", "4", "--minutes", "0"
     )
@@ -110,6 +115,7 @@ def test_mutants_are_killed_or_survive_and_a_run_continues(
     run(repository, table, "--sample", "50")
     with table.open(newline="") as lines:
         rows = {(r["was"], r["result"]) for r in csv.DictReader(lines)}
+    # The tested function's mutants are killed, those of the unused one survive.
     assert ("return x / scale", "killed") in rows and (
         "return x + 1",
         "survived",
@@ -117,6 +123,7 @@ def test_mutants_are_killed_or_survive_and_a_run_continues(
     assert ("return x / scale", "survived") not in rows
     assert (repository / "distfilt" / "a.py").read_text() == LIBRARY
     text = table.read_text()
+    # Reasons are written into the table by hand, and must survive the next run.
     reasoned = re.sub(r"^(.*,survived,.*)$", r"\1dead code", text, flags=re.M)
     table.write_text(reasoned)
     assert run(repository, table, "--sample", "50").count("distfilt/a.py") == 0

@@ -63,6 +63,7 @@ def trace_calls(action: Callable[[], Any]) -> list[Call]:
         elif event == "return":
             depth -= 1
 
+    # The profiler sees every call of a Python function, by whatever name it was made.
     sys.setprofile(profile)
     try:
         action()
@@ -117,6 +118,7 @@ def print_report(title: str, calls: list[Call], verbose: bool) -> None:
         f"{count_modules(calls)} modules, depth {deepest}"
     )
     if verbose:
+        # Each function once, at the depth of its first call
         for call in dict.fromkeys(calls):
             print(f"{'  ' * call.depth}{call.module}: {call.function}")
 

@@ -15,9 +15,11 @@ def samples(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw correlated, shifted, badly scaled samples (y, x)."""
     rng = rng_of(seed)
-    mixing = rng.standard_normal((m + d, m + d)) * np.logspace(-1, 1, m + d)
-    z = rng.standard_normal((*leading, n, m + d)) @ mixing
-    z += 10 * rng.standard_normal(m + d)
+    size = m + d
+    units = np.logspace(-1, 1, size)
+    mixing = rng.standard_normal((size, size)) * units
+    z = rng.standard_normal((*leading, n, size)) @ mixing
+    z += 10 * rng.standard_normal(size)
     return z[..., :m], z[..., m:]
 
 
@@ -26,6 +28,8 @@ def banana(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Draw members on a parabola: noisy observations of x_2, members, and their normals."""
     u = rng_of(seed).standard_normal((*leading, n, 3))
-    x = np.stack([u[..., 0], 0.5 * u[..., 1] + u[..., 0] ** 2], axis=-1)
+    first = u[..., 0]
+    second = 0.5 * u[..., 1] + first**2
+    x = np.stack([first, second], axis=-1)
     y = x[..., 1:] + 0.3 * u[..., 2:]
     return y, x, u[..., :2]

@@ -26,8 +26,10 @@ def test_a_map_whitens_and_inverts(seed: int, m: int, d: int) -> None:
     y, x = samples(seed, 60, m, d)
     s = fit(y, x)
     z = s(y, x)
+    # The minimiser's moments are exactly those of N(0, I), with N in the denominator.
     assert np.allclose(z.mean(axis=0), 0, atol=1e-7)
-    assert np.allclose(z.T @ z / len(z), np.eye(d), atol=1e-6)
+    second_moment = z.T @ z / len(z)
+    assert np.allclose(second_moment, np.eye(d), atol=1e-6)
     assert np.allclose(s.inverse(y, z), x, rtol=1e-9, atol=1e-9)
 
 
@@ -37,10 +39,13 @@ def test_maps_are_batched() -> None:
     batch = fit(y, x)
     ensemble = (y[1, 2], x[1, 2])
     single = fit(*ensemble)
-    assert np.allclose(batch(y, x)[1, 2], single(*ensemble), atol=1e-12)
-    assert np.allclose(batch.log_det(y, x)[1, 2], single.log_det(*ensemble))
+    z = batch(y, x)
+    assert np.allclose(z[1, 2], single(*ensemble), atol=1e-12)
+    log_det = batch.log_det(y, x)
+    assert np.allclose(log_det[1, 2], single.log_det(*ensemble))
     values = objective(batch, y, x)
-    assert np.allclose(values[1, 2], objective(single, *ensemble), atol=1e-12)
+    expected = objective(single, *ensemble)
+    assert np.allclose(values[1, 2], expected, atol=1e-12)
 
 
 @given(st.integers(0, 10_000))
@@ -49,7 +54,9 @@ def test_log_det_is_that_of_the_derivative(seed: int) -> None:
     y, x = samples(seed)
     s = fit(y, x)
     shifted = x[0] + np.eye(3)
-    rows = s(np.repeat(y[:1], 3, axis=0), shifted) - s(y[:1], x[:1])
+    same_y = np.repeat(y[:1], 3, axis=0)
+    # S(x + e_j) - S(x) is column j of the derivative.
+    rows = s(same_y, shifted) - s(y[:1], x[:1])
     derivative = rows.T
     log_det = np.linalg.slogdet(derivative)[1]
     assert np.isclose(log_det, s.log_det(y, x)[0], rtol=1e-9, atol=1e-9)
@@ -60,9 +67,12 @@ def test_coefficients_and_moments_give_the_same_map() -> None:
     """S = c + B y + A x with A = L^-1, B = -L^-1 K and c = L^-1 (K mean(y) - mean(x))."""
     y, x = samples(21, m=2, d=3)
     s = fit(y, x)
-    coefficients = np.linalg.solve(s.scale, np.hstack([-s.gain, np.eye(3)]))
+    right = np.hstack([-s.gain, np.eye(3)])
+    coefficients = np.linalg.solve(s.scale, right)
+    # The solve leaves rounding above the diagonal of A.
     coefficients[:, 2:] = np.tril(coefficients[:, 2:])
-    offset = np.linalg.solve(s.scale, s.gain @ s.observed_mean - s.mean)
+    shift = s.gain @ s.observed_mean - s.mean
+    offset = np.linalg.solve(s.scale, shift)
     rows = np.hstack([offset[:, None], coefficients])
     # About any y, here another than the mean.
     by_rows = affine.from_rows(rows, np.array([5.0, -3.0]))
@@ -82,6 +92,7 @@ def test_the_program_is_compiled_once_for_each_size() -> None:
         exact = compose(fit(y, x), y, x, y[0])
         solved = compose(fit_convex(y, x), y, x, y[0])
         assert np.abs(exact - solved).max() < 1e-6
+    # Component k has k + 1 variables: two sizes, each met twice.
     info = _compile_program.cache_info()
     assert (info.misses, info.hits) == (2, 2)
     assert info.maxsize is not None
@@ -91,6 +102,7 @@ def test_the_program_does_not_depend_on_earlier_samples() -> None:
     """After other samples, and after another solver, the same samples give the same bits."""
     y, x = samples(3, m=1, d=2)
     first = fit_convex(y, x)
+    # Neither a warm start nor a solver's setting may remain in the compiled program.
     fit_convex(*samples(4, m=1, d=2))
     fit_convex(y, x, solver="CLARABEL")
     assert np.array_equal(fit_convex(y, x).scale, first.scale)
@@ -144,6 +156,7 @@ def test_samples_without_a_map_are_refused_by_name(
 def test_the_rounding_of_a_repeated_variable_is_no_variance() -> None:
     """Such a covariance may have a Cholesky factor."""
     covariance = np.array([[4.0, 4.0], [4.0, 4.0 + 4e-15]])
+    # 4 + 4e-15 - 4² / 4 is rounding, but positive.
     assert np.linalg.cholesky(covariance)[1, 1] > 0
     with pytest.raises(ValueError, match=r"x must .* not combinations of others"):
         affine.from_moments(np.ones(2), covariance, 1)
@@ -167,8 +180,12 @@ def test_the_composed_affine_map_is_the_enkf(seed: int, m: int, d: int) -> None:
     y, x = samples(seed, 60, m, d)
     observed = rng_of(seed + 1).standard_normal(m)
     joint = np.cov(np.hstack([x, y]), rowvar=False)
-    gain = joint[:d, d:] @ np.linalg.inv(joint[d:, d:])
+    # K = C_xy C_yy⁻¹; the noise is part of the predictions y.
+    cross = joint[:d, d:]
+    predicted_cov = joint[d:, d:]
+    gain = cross @ np.linalg.inv(predicted_cov)
     expected = x + (observed - y) @ gain.T
     composed = compose(fit(y, x), y, x, observed)
-    unit = max(1, np.abs(expected).max(), np.linalg.cond(joint[d:, d:]))
+    condition = np.linalg.cond(predicted_cov)
+    unit = max(1, np.abs(expected).max(), condition)
     assert np.abs(composed - expected).max() < 1e-12 * unit

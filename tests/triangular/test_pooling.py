@@ -23,17 +23,21 @@ def _samples(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw correlated samples of each agent, whose means differ."""
     rng = np.random.default_rng(seed)
-    mixing = np.eye(m + d) + 0.3 * rng.standard_normal((m + d, m + d))
-    z = rng.standard_normal((agents, n, m + d)) @ mixing
-    z += 0.3 * rng.standard_normal((agents, 1, m + d))
+    size = m + d
+    perturbation = rng.standard_normal((size, size))
+    mixing = np.eye(size) + 0.3 * perturbation
+    z = rng.standard_normal((agents, n, size)) @ mixing
+    z += 0.3 * rng.standard_normal((agents, 1, size))
     if badly_scaled:
-        z = 100 + z * np.logspace(-2, 2, m + d)
+        z = 100 + z * np.logspace(-2, 2, size)
     return z[..., :m], z[..., m:]
 
 
 def _fit_all(y: np.ndarray, x: np.ndarray) -> AffineMap:
     """Return the map of all agents' samples together."""
-    return affine.fit(y.reshape(-1, y.shape[-1]), x.reshape(-1, x.shape[-1]))
+    flat_y = y.reshape(-1, y.shape[-1])
+    flat_x = x.reshape(-1, x.shape[-1])
+    return affine.fit(flat_y, flat_x)
 
 
 _FIELDS = ("observed_mean", "mean", "gain", "scale")
@@ -50,11 +54,14 @@ def test_averaged_moments_give_the_map_of_all_samples(
     """In every field and for every agent."""
     y, x = _samples(seed, graph.n_agents)
     pooled = pool_by_moments(y, x, Channel(graph))
+    # Mean and covariance of all samples are averages over agents of equal size, and the
+    # affine map depends on nothing else.
     central = _fit_all(y, x)
     for name in _FIELDS:
         expected = getattr(central, name)
         error = np.abs(getattr(pooled, name) - expected).max()
-        assert error < 1e-12 * max(1.0, np.abs(expected).max())
+        scale = max(1.0, np.abs(expected).max())
+        assert error < 1e-12 * scale
 
 
 def test_averaged_moments_in_several_runs_and_their_cost() -> None:
@@ -66,8 +73,10 @@ def test_averaged_moments_in_several_runs_and_their_cost() -> None:
     channel = Channel(graphs.complete(3), runs=(2,))
     pooled = pool_by_moments(y, x, channel)
     for run in range(2):
-        error = pooled.gain[run] - _fit_all(y[run], x[run]).gain
+        central = _fit_all(y[run], x[run])
+        error = pooled.gain[run] - central.gain
         assert np.abs(error).max() < 1e-11
+    # Each agent has two neighbours.
     assert channel.ledger.rounds == 2
     assert (channel.ledger.scalars == 2 * 90).all()
 
@@ -90,8 +99,11 @@ def test_admm_converges_to_the_map_of_all_samples(
         fields = {name: getattr(solved, name)[agent] for name in _FIELDS}
         map_ = AffineMap(**fields)
         error = compose(map_, flat_y, flat_x, y[0, 0]) - expected
-        assert (np.abs(error) / flat_x.std(axis=0)).max() < 1e-4
-        assert np.abs(map_(flat_y, flat_x) - reference).max() < 1e-4
+        relative_error = np.abs(error) / flat_x.std(axis=0)
+        assert relative_error.max() < 1e-4
+        # Reference samples have no unit.
+        reference_error = map_(flat_y, flat_x) - reference
+        assert np.abs(reference_error).max() < 1e-4
 
 
 @pytest.mark.parametrize("gain", [2.0, 1000.0])
@@ -99,7 +111,8 @@ def test_a_rule_that_diverges_is_named(gain: float) -> None:
     """The error is not about the samples, although their averages have no factor."""
 
     def diverge(values: np.ndarray, channel: Channel) -> np.ndarray:
-        return values + 10 * gain * (values - values.mean(axis=0))
+        deviation = values - values.mean(axis=0)
+        return values + 10 * gain * deviation
 
     message = "average must be a rule that returns averages"
     for pool in (pool_by_moments, pool_by_admm):
@@ -112,17 +125,16 @@ def test_a_variable_that_differs_only_between_agents_is_not_constant() -> None:
     y, x = _samples(6)
     x[..., 0] = np.arange(3.0)[:, None]
     pooled = pool_by_moments(y, x, Channel(graphs.path(3)))
-    assert np.abs(pooled.scale[0] - _fit_all(y, x).scale).max() < 1e-12
+    central = _fit_all(y, x)
+    error = pooled.scale[0] - central.scale
+    assert np.abs(error).max() < 1e-12
 
 
 def test_rho_changes_the_iterations_and_not_the_solution() -> None:
     """The penalty of ADMM is no part of the problem."""
     y, x = _samples(7)
-    small, small_run = pool_by_admm(
-        y, x, Channel(graphs.path(3)), rho=0.5, tolerance=1e-9
-    )
-    large, large_run = pool_by_admm(
-        y, x, Channel(graphs.path(3)), rho=2.0, tolerance=1e-9
-    )
+    graph = graphs.path(3)
+    small, small_run = pool_by_admm(y, x, Channel(graph), rho=0.5, tolerance=1e-9)
+    large, large_run = pool_by_admm(y, x, Channel(graph), rho=2.0, tolerance=1e-9)
     assert small_run.iterations != large_run.iterations
     assert np.abs(small.gain - large.gain).max() < 1e-6

@@ -22,15 +22,21 @@ _Y, _X, _ = banana(9, 60)
 def test_order_zero_is_the_affine_map(seed: int, m: int, d: int) -> None:
     """Without bumps: its values, log-determinants and composed map."""
     rng = rng_of(seed)
-    mixing = np.eye(m + d) + 0.3 * rng.standard_normal((m + d, m + d))
-    z = 5 + rng.standard_normal((60, m + d)) @ mixing * np.logspace(-1, 1, m + d)
+    size = m + d
+    perturbation = rng.standard_normal((size, size))
+    mixing = np.eye(size) + 0.3 * perturbation
+    units = np.logspace(-1, 1, size)
+    z = 5 + rng.standard_normal((60, size)) @ mixing * units
     y = z[:, :m]
     x = z[:, m:]
     s = fit(y, x, order=0)
     expected = affine.fit(y, x)
-    assert np.abs(s(y, x) - expected(y, x)).max() < 1e-8
-    assert np.abs(s.log_det(y, x) - expected.log_det(y, x)).max() < 1e-8
-    difference = compose(s, y, x, y[0]) - compose(expected, y, x, y[0])
+    value_error = s(y, x) - expected(y, x)
+    assert np.abs(value_error).max() < 1e-8
+    log_det_error = s.log_det(y, x) - expected.log_det(y, x)
+    assert np.abs(log_det_error).max() < 1e-8
+    expected_members = compose(expected, y, x, y[0])
+    difference = compose(s, y, x, y[0]) - expected_members
     assert np.abs(difference).max() < 1e-8
 
 
@@ -38,7 +44,8 @@ def test_a_large_penalty_gives_the_affine_map() -> None:
     """The penalty is on the bumps only."""
     s = fit(_Y, _X, order=2, regularisation=1e9)
     expected = affine.fit(_Y, _X)
-    assert np.abs(s(_Y, _X) - expected(_Y, _X)).max() < 1e-6
+    error = s(_Y, _X) - expected(_Y, _X)
+    assert np.abs(error).max() < 1e-6
 
 
 # ------------------------------------------------------------------------------ properties
@@ -50,8 +57,10 @@ def test_a_map_increases_inverts_and_is_triangular(seed: int, p: int, q: int) ->
     y, x, _ = banana(seed)
     s = fit(y, x, order=(p, q))
     z = s(y, x)
-    assert np.abs(s.inverse(y, z) - x).max() < 1e-9
+    inverse_error = s.inverse(y, z) - x
+    assert np.abs(inverse_error).max() < 1e-9
     for slopes in s.slopes:
+        # Nonnegative steps and a line of slope 0.1 or more: each component increases.
         assert (slopes >= 0).all()
         assert slopes[0] >= 0.1
     shifted = x.copy()
@@ -67,8 +76,11 @@ def test_a_batched_fit_is_each_ensemble_s() -> None:
     batch = fit(y, x, order=2)
     single = fit(y[1, 2], x[1, 2], order=2)
     z = batch(y, x)
-    assert np.abs(z[1, 2] - single(y[1, 2], x[1, 2])).max() < 1e-7
-    assert np.abs(batch.inverse(y, z) - x).max() < 1e-9
+    expected = single(y[1, 2], x[1, 2])
+    assert np.abs(z[1, 2] - expected).max() < 1e-7
+    inverse_error = batch.inverse(y, z) - x
+    assert np.abs(inverse_error).max() < 1e-9
+    # One observation for all members of an ensemble
     observed = y[..., 0, :]
     inverse = batch.inverse(observed, z)[1, 2]
     expected = single.inverse(observed[1, 2], z[1, 2])
@@ -80,19 +92,23 @@ def test_sparse_components_do_not_depend_on_other_variables() -> None:
     y, x, _ = banana(7)
     s = fit(y, x, order=2, uses=[[], [1]])
     without_y = fit(y[:, :0], x, order=2)
+    # A constant; and a constant, a line and two bumps of x_1.
     assert s.weights[0].shape == (1,)
     assert s.weights[1].shape == (4,)
-    assert np.allclose(s(y, x), without_y(y[:, :0], x), atol=1e-12)
+    expected = without_y(y[:, :0], x)
+    assert np.allclose(s(y, x), expected, atol=1e-12)
     assert (s(y + 1, x) == s(y, x)).all()
     # The full map has the sparse one as a special case.
     full = fit(y, x, order=2)
-    assert affine.objective(full, y, x) <= affine.objective(s, y, x)
+    full_value = affine.objective(full, y, x)
+    assert full_value <= affine.objective(s, y, x)
 
 
 def test_sparse_components_need_few_members() -> None:
     """Fewer members than variables are enough if each component uses few of them."""
     y, x, _ = banana(7)
-    assert fit(y[:8], x[:8], order=2, uses=[[], [0]])(y, x).shape == x.shape
+    few = fit(y[:8], x[:8], order=2, uses=[[], [0]])
+    assert few(y, x).shape == x.shape
     wide = rng_of(1).standard_normal((20, 30))
     chain = [[], *([k] for k in range(29))]
     s = fit(wide[:, :0], wide, order=1, uses=chain)
@@ -105,7 +121,9 @@ def test_the_inverse_extends_far_beyond_the_samples() -> None:
     s = fit(y, x, order=3)
     z = 50 * rng_of(1).standard_normal((100, 2))
     members = s.inverse([30.0], z)
-    assert np.abs(s(np.full((100, 1), 30.0), members) - z).max() < 1e-8
+    observed = np.full((100, 1), 30.0)
+    error = s(observed, members) - z
+    assert np.abs(error).max() < 1e-8
 
 
 # ------------------------------------------------------------------------- the formula
@@ -117,15 +135,20 @@ def _features(s: SeparableMap, v: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
     Those of earlier variables, those of its own variable, and the derivatives of the latter.
     """
     used = s.uses[k]
-    own_values = v[:, v.shape[1] - len(s.uses) + k]
+    # The state's variables are the last ones.
+    n_observed = v.shape[1] - len(s.uses)
+    own_values = v[:, n_observed + k]
     bumps = []
     for variable in used:
         for centre, width in s.bumps[:, variable].T:
-            bumps.append(np.exp(-0.5 * ((v[:, variable] - centre) / width) ** 2))
+            # exp(-½ u²)
+            u = (v[:, variable] - centre) / width
+            bumps.append(np.exp(-0.5 * u**2))
     integrals = []
     derivatives = []
     for centre, width in s.steps[:, k].T:
         u = (own_values - centre) / width
+        # ∫ exp(-½ u²) = √(2 π) σ Φ(u)
         integrals.append(np.sqrt(2 * np.pi) * width * norm.cdf(u))
         derivatives.append(np.exp(-0.5 * u**2))
     ones = np.ones(len(v))
@@ -137,10 +160,13 @@ def _features(s: SeparableMap, v: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
 
 def _map_by_hand() -> tuple[SeparableMap, np.ndarray]:
     """Return a map and three points: m = 1, d = 2, two bumps and steps each, all different."""
-    bumps = np.array(
-        [[[-0.5, 0.6], [-0.4, 0.3], [0.1, 0.9]], [[0.7, 0.5], [0.8, 1.1], [0.6, 0.9]]]
-    )
-    steps = np.array([[[-0.7, 0.2], [0.4, 1.3]], [[0.5, 0.9], [0.8, 0.6]]])
+    # Centres and widths, for each variable
+    bump_centres = [[-0.5, 0.6], [-0.4, 0.3], [0.1, 0.9]]
+    bump_widths = [[0.7, 0.5], [0.8, 1.1], [0.6, 0.9]]
+    bumps = np.array([bump_centres, bump_widths])
+    step_centres = [[-0.7, 0.2], [0.4, 1.3]]
+    step_widths = [[0.5, 0.9], [0.8, 0.6]]
+    steps = np.array([step_centres, step_widths])
     weights = [
         np.array([0.3, -0.8, 0.5, -0.2]),
         np.array([-0.1, 0.7, 0.4, 0.6, -0.5, 0.25, 0.9]),
@@ -162,10 +188,14 @@ def test_coefficients_set_by_hand_against_the_formula() -> None:
     z = s(y, x)
     log_det = np.zeros(3)
     for k in range(2):
-        earlier, increasing, rates = _features(s, (points - s.centre) / s.std, k)
-        component = earlier @ s.weights[k] + increasing @ s.slopes[k]
+        standard = (points - s.centre) / s.std
+        earlier, increasing, rates = _features(s, standard, k)
+        offset = earlier @ s.weights[k]
+        component = offset + increasing @ s.slopes[k]
         assert np.abs(z[:, k] - component).max() < 1e-12
-        log_det += np.log(rates @ s.slopes[k] / s.std[1 + k])
+        # A triangular map's determinant is the product of its diagonal derivatives.
+        derivative = rates @ s.slopes[k] / s.std[1 + k]
+        log_det += np.log(derivative)
     assert np.abs(s.log_det(y, x) - log_det).max() < 1e-12
     assert np.abs(s.inverse(y, z) - x).max() < 1e-12
 
@@ -183,16 +213,20 @@ def test_a_fit_minimises_a_program_built_by_hand(penalty: float) -> None:
         weights = c[:n_weights]
         slopes = c[n_weights:]
         value = earlier @ weights + increasing @ slopes
+        # ½ S² - log ∂S
         terms = 0.5 * value**2 - np.log(rates @ slopes)
         # The constant, two lines, and the own line have no penalty.
-        squares = (weights[3:] ** 2).sum() + (slopes[1:] ** 2).sum()
+        penalised = np.concatenate([weights[3:], slopes[1:]])
+        squares = (penalised**2).sum()
         return float(terms.mean() + 0.5 * penalty * squares)
 
     solution = np.concatenate([s.weights[1], s.slopes[1]])
     lower = np.full(solution.size, -np.inf)
     lower[n_weights] = 0.1
     lower[n_weights + 1 :] = 0.0
-    for step in 1e-4 * np.vstack([np.eye(solution.size), -np.eye(solution.size)]):
+    # The program is convex: a minimum among the neighbours is the minimum.
+    identity = np.eye(solution.size)
+    for step in 1e-4 * np.vstack([identity, -identity]):
         neighbour = solution + step
         is_feasible = (neighbour >= lower).all()
         assert not is_feasible or loss(neighbour) > loss(solution)
@@ -205,13 +239,17 @@ def test_bumps_are_placed_at_quantiles() -> None:
     joint = np.hstack([y, x])
     joint = (joint - joint.mean(axis=0)) / joint.std(axis=0)
     for variable in range(3):
+        # Two bumps: centres at 2/6 and 4/6, widths from 1/6 to 3/6 and from 3/6 to 5/6.
         quantile = np.quantile(joint[:, variable], np.arange(1, 6) / 6)
-        assert np.allclose(s.bumps[0, variable], quantile[[1, 3]])
-        assert np.allclose(s.bumps[1, variable], quantile[[2, 4]] - quantile[[0, 2]])
+        centres, widths = s.bumps[:, variable]
+        assert np.allclose(centres, quantile[[1, 3]])
+        assert np.allclose(widths, quantile[[2, 4]] - quantile[[0, 2]])
     for k in range(2):
+        # Three steps at 2/8, 4/8 and 6/8 of the state's variables
         quantile = np.quantile(joint[:, 1 + k], np.arange(1, 8) / 8)
-        assert np.allclose(s.steps[0, k], quantile[[1, 3, 5]])
-        assert np.allclose(s.steps[1, k], quantile[[2, 4, 6]] - quantile[[0, 2, 4]])
+        centres, widths = s.steps[:, k]
+        assert np.allclose(centres, quantile[[1, 3, 5]])
+        assert np.allclose(widths, quantile[[2, 4, 6]] - quantile[[0, 2, 4]])
 
 
 # ------------------------------------------------------------------------------- inversion
@@ -269,14 +307,24 @@ def test_newton_s_method_does_not_alternate(target: float, steep: float) -> None
 
     def bend(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         u = steep * v
-        return np.arctan(u) + 1e-3 * v, steep / (1 + u**2) + 1e-3
+        value = np.arctan(u) + 1e-3 * v
+        slope = steep / (1 + u**2) + 1e-3
+        return value, slope
 
-    v = invert(bend, np.array([target]), *_bracket(np.zeros(1), 1e4))
-    assert abs(bend(v)[0][0] - target) < 1e-9
+    low, high = _bracket(np.zeros(1), 1e4)
+    v = invert(bend, np.array([target]), low, high)
+    value, _ = bend(v)
+    assert abs(value[0] - target) < 1e-9
 
 
 def test_the_tolerance_is_relative_to_the_value() -> None:
     """At 1e8 two neighbouring numbers are 1.5e-8 apart: no step is ever below 1e-13."""
+
+    def cubic(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return v**3 + v, 3 * v**2 + 1
+
+    # v³ + v at ±1e8
     target = np.array([1e24 + 1e8, -1e24 - 1e8])
-    v = invert(lambda v: (v**3 + v, 3 * v**2 + 1), target, *_bracket(target, 1e9))
+    low, high = _bracket(target, 1e9)
+    v = invert(cubic, target, low, high)
     assert np.allclose(v, [1e8, -1e8], rtol=1e-13)

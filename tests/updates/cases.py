@@ -67,7 +67,9 @@ def kalman(
     mean: np.ndarray, cov: np.ndarray, h: np.ndarray, r: np.ndarray, y: np.ndarray
 ):
     """Return the Kalman filter's posterior mean and covariance by its formulas."""
-    gain = cov @ h.T @ np.linalg.inv(h @ cov @ h.T + r)
+    # K = P Hᵀ (H P Hᵀ + R)⁻¹
+    innovation_cov = h @ cov @ h.T + r
+    gain = cov @ h.T @ np.linalg.inv(innovation_cov)
     posterior_mean = mean + gain @ (y - h @ mean)
     posterior_cov = (np.eye(len(mean)) - gain @ h) @ cov
     return posterior_mean, posterior_cov

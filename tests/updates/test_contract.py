@@ -19,12 +19,16 @@ def test_an_update_depends_on_its_arguments_and_the_generator_only(name: str) ->
     x = members(30, 2)
     data = (x, x @ H.T, np.tile(Y, (2, 1)), R.copy())
     copies = [array.copy() for array in data]
+    # Two ensembles with the same observation and noise
     analysis = update(*data, rng=rng(5))
     assert analysis.shape == x.shape
     assert np.isfinite(analysis).all()
-    assert (analysis == update(*data, rng=rng(5))).all()
-    assert (analysis == without_checks(update)(*data, rng=rng(5))).all()
-    assert (analysis != update(*data, rng=rng(6))).any()
+    same_seed = update(*data, rng=rng(5))
+    assert (analysis == same_seed).all()
+    unchecked = without_checks(update)(*data, rng=rng(5))
+    assert (analysis == unchecked).all()
+    other_seed = update(*data, rng=rng(6))
+    assert (analysis != other_seed).any()
     # The inputs are neither changed nor part of the result.
     assert not np.shares_memory(analysis, x)
     for array, copy in zip(data, copies, strict=True):
@@ -43,4 +47,5 @@ def test_a_noise_covariance_for_each_ensemble(name: str) -> None:
         uniform = update(x, x @ H.T, y, noise[k], rng=rng())
         assert np.allclose(analysis[k], uniform[k], rtol=0, atol=1e-9)
         # The other ensemble has another covariance, which matters.
-        assert np.abs(analysis[1 - k] - uniform[1 - k]).max() > 0.2
+        difference = analysis[1 - k] - uniform[1 - k]
+        assert np.abs(difference).max() > 0.2

@@ -25,7 +25,9 @@ def test_systematic_resampling_inverts_the_distribution_function(
 ) -> None:
     """The index of each level (k + u) / N is found in the cumulative weights, by numpy's search."""
     weights = rng(seed).dirichlet(np.full(n, 0.2), size=4)
-    levels = (np.arange(n) + rng(6).random((4, 1))) / n
+    # One uniform number u for each row, drawn as `resample` draws it.
+    uniform = rng(6).random((4, 1))
+    levels = (np.arange(n) + uniform) / n
     indices = resample(weights, rng=rng(6))
     for row in range(4):
         edges = np.cumsum(weights[row]) / weights[row].sum()
@@ -35,6 +37,7 @@ def test_systematic_resampling_inverts_the_distribution_function(
 
 def test_effective_size_is_between_one_and_n() -> None:
     """One weight counts one, n equal weights count n, in any normalisation."""
+    # (Σ w)² / Σ w²
     assert effective_size([0.0, -np.inf, -np.inf]) == pytest.approx(1.0)
     assert effective_size(np.full(8, -1e6)) == pytest.approx(8.0)
     assert effective_size(np.log([0.5, 0.5])) == pytest.approx(2.0)
@@ -61,7 +64,9 @@ def test_weights_by_bayes_rule_with_a_missing_component() -> None:
     for k in range(2):
         partial_y = np.full(2, np.nan)
         partial_y[k] = y[k]
-        marginal = _normalise(prior - 0.5 * innovation[:, k] ** 2 / noise[k, k])
+        # y_k alone is N(h_k, R_kk).
+        squares = innovation[:, k] ** 2 / noise[k, k]
+        marginal = _normalise(prior - 0.5 * squares)
         log_weights = reweight(prior, h, partial_y, noise)
         assert np.allclose(np.exp(log_weights), marginal)
     # A particle that cannot predict what was seen contradicts it.
@@ -85,7 +90,8 @@ def _mean_covariance(ensembles: np.ndarray) -> np.ndarray:
 
 def test_jitter_keeps_mean_and_covariance_on_average() -> None:
     """(1 - h²) C from the shrinkage and h² C from the noise make C."""
-    x = rng(0).standard_normal((2000, 50, 2)) @ np.array([[1.0, 0.6], [0.0, 0.4]])
+    factor = np.array([[1.0, 0.6], [0.0, 0.4]])
+    x = rng(0).standard_normal((2000, 50, 2)) @ factor
     jittered = jitter(x, rng=rng(1), bandwidth=0.5)
     shift = jittered.mean(axis=1) - x.mean(axis=1)
     assert np.abs(shift.mean(axis=0)).max() < 0.01
@@ -100,7 +106,9 @@ def test_jitter_keeps_mean_and_covariance_on_average() -> None:
 
 def test_silverman_s_bandwidth() -> None:
     """(4 / (n (d + 2)))^(1 / (d + 4)), at most one."""
-    assert silverman(40, 3) == pytest.approx((4 / (40 * 5)) ** (1 / 7))
+    expected = (4 / (40 * 5)) ** (1 / 7)
+    assert silverman(40, 3) == pytest.approx(expected)
+    # (4 / 3)^(1/5) > 1
     assert silverman(1, 1) == 1
 
 
@@ -108,18 +116,23 @@ def test_jitter_of_copies_changes_only_them() -> None:
     """Of 2, 1, 3 and 1 copies the single ones stay; the others have the given covariance."""
     counts = np.tile([2, 1, 3, 1, 0, 0, 0], (4000, 1))
     values = np.tile(np.arange(7.0), (4000, 1))
-    x = repeat_by_count(values[..., None] * [1.0, -2.0], counts)
-    is_copy = repeat_by_count(counts[..., None] > 1, counts)[..., 0]
+    members = values[..., None] * [1.0, -2.0]
+    x = repeat_by_count(members, counts)
+    has_copies = counts[..., None] > 1
+    is_copy = repeat_by_count(has_copies, counts)[..., 0]
     assert np.array_equal(x[5, :, 0], [0, 0, 1, 2, 2, 2, 3])
     covariance = np.array([[2.0, 0.6], [0.6, 0.5]])
     normal = rng().standard_normal(x.shape)
     jittered = add_jitter(x, covariance, 0.5, normal, is_copy)
+    # Members 2 and 6 have no copy.
     single = [2, 6]
     copies = [0, 1, 3, 4, 5]
     assert (jittered[:, single] == x[:, single]).all()
+    # No two members coincide any more.
     assert (distinct_fraction(jittered) == 1).all()
     noise = (jittered - x)[:, copies].reshape(-1, 2)
     # Four standard errors of a mean, and of a covariance.
     error = 4 * np.sqrt(2 / len(noise))
     assert np.abs(noise.mean(axis=0)).max() < 0.5 * error
-    assert np.allclose(np.cov(noise.T), 0.25 * covariance, atol=0.25 * 2 * error)
+    expected = 0.25 * covariance
+    assert np.allclose(np.cov(noise.T), expected, atol=0.25 * 2 * error)

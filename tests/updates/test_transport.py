@@ -35,8 +35,10 @@ def test_principal_directions_have_the_largest_variance(seed: int, n: int) -> No
     ensemble = samples(seed, m=1, d=4)[1]
     directions = principal_directions(ensemble, n)
     assert np.allclose(directions.T @ directions, np.eye(n), atol=1e-12)
-    eigenvalues = np.linalg.eigvalsh(np.cov(ensemble, rowvar=False))[::-1]
-    latent = np.cov(ensemble @ directions, rowvar=False).reshape(n, n)
+    cov = np.cov(ensemble, rowvar=False)
+    eigenvalues = np.linalg.eigvalsh(cov)[::-1]
+    scores = ensemble @ directions
+    latent = np.cov(scores, rowvar=False).reshape(n, n)
     assert np.allclose(latent.diagonal(), eigenvalues[:n], rtol=1e-8)
 
 
@@ -44,6 +46,7 @@ def test_the_complement_of_the_principal_directions() -> None:
     """Outside the leading directions the state stays, or is zero, by the option."""
     ensemble = _DATA[0]
     directions = principal_directions(ensemble, 2)
+    # I - V Vᵀ projects on the orthogonal complement.
     complement = np.eye(3) - directions @ directions.T
     options = {"n_state": 2, "n_observed": 2}
     keep = principal_components(*_DATA, rng=rng_of(3), **options)
@@ -63,7 +66,9 @@ def test_the_noise_factor_scales_the_draw_and_nothing_else(factor: float) -> Non
     normal = rng_of(3).standard_normal(h.shape)
     perturbed = h + factor * normal @ np.linalg.cholesky(noise).T
     map_ = affine.fit(perturbed, x)
-    expected = map_.inverse(y, map_(perturbed, x))
+    # S(y*, ·)⁻¹ ∘ S(y_i, x_i)
+    reference = map_(perturbed, x)
+    expected = map_.inverse(y, reference)
     analysis = transport_map_update(*_DATA, rng=rng_of(3), noise_factor=factor)
     assert np.allclose(analysis, expected, atol=1e-10)
     for complement in ("keep", "literal"):
@@ -89,7 +94,8 @@ def test_etpf_by_its_formula() -> None:
     analysis = etpf(x, x @ H.T, Y, R, rng=rng_of())
     transformed = coupling.transform_ensemble(x, np.log(weights))
     assert np.allclose(analysis, transformed, atol=1e-10)
-    assert np.abs(analysis.mean(axis=0) - weights @ x).max() < 1e-13
+    mean_error = analysis.mean(axis=0) - weights @ x
+    assert np.abs(mean_error).max() < 1e-13
     corrected = etpf(x, x @ H.T, Y, R, rng=rng_of(), correct=True)
     weighted_covariance = np.cov(x.T, aweights=weights, bias=True)
     covariance = np.cov(corrected.T, bias=True)
@@ -113,11 +119,13 @@ def test_a_lost_spread_warns() -> None:
     # Three deviations are no reason to warn.
     etpf(x, h, predicted_mean + 3 * std, R, rng=rng_of())
     far = 6 * std
+    # dᵀ R⁻¹ d is χ² distributed with two degrees of freedom: its mean is 2.
     distance = far @ np.linalg.solve(R, far)
     message = rf"squared distance .* is {distance:.0f}, not 2;"
     # Of two ensembles the second one is far from its observation.
+    y = [predicted_mean, predicted_mean + far]
     with pytest.warns(ParticleCollapse, match=message):
-        etpf([x, x], [h, h], [predicted_mean, predicted_mean + far], R, rng=rng_of())
+        etpf([x, x], [h, h], y, R, rng=rng_of())
 
 
 def test_nothing_is_drawn_without_rejuvenation() -> None:
@@ -129,5 +137,6 @@ def test_nothing_is_drawn_without_rejuvenation() -> None:
     first = etpf(*data, rng=rng_of(1), rejuvenation=0.2)
     second = etpf(*data, rng=rng_of(2), rejuvenation=0.2)
     assert (first != second).any()
+    # Rejuvenation follows the transform, with the same generator.
     expected = coupling.rejuvenate(transformed, x, bandwidth=0.2, rng=rng_of(1))
     assert np.array_equal(first, expected)

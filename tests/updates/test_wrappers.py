@@ -29,6 +29,7 @@ def test_inflation_multiplies_anomalies_only() -> None:
     data = (x, x @ H.T, Y, R)
     analysis = updates.enkf(*data, rng=rng())
     inflated = updates.with_inflation(updates.enkf, factor=1.3)(*data, rng=rng())
+    # m + λ (x - m)
     mean = analysis.mean(axis=0)
     assert np.allclose(inflated, mean + 1.3 * (analysis - mean), atol=1e-12)
 
@@ -43,7 +44,8 @@ def test_a_missing_component_is_a_deleted_row() -> None:
     h = np.column_stack([x @ H.T, x[:, 0]])
     y = np.array([1.2, -0.7, 0.4])
     rows = [0, 2]
-    expected = ETKF(x, h[:, rows], y[rows], noise[np.ix_(rows, rows)], rng=rng())
+    block = noise[np.ix_(rows, rows)]
+    expected = ETKF(x, h[:, rows], y[rows], block, rng=rng())
     without_value = y.copy()
     without_value[1] = np.nan
     analysis = updates.with_missing(ETKF, x, h, without_value, noise, rng=rng())
@@ -60,6 +62,7 @@ def test_missing_components_in_a_stack_with_several_covariances(name: str) -> No
     x = members(30, 3)
     h = x @ H.T
     noise = np.stack([R, 2 * R, 3 * R])
+    # Complete, without the second component, and without any
     y = np.stack([Y, [Y[0], np.nan], [np.nan, np.nan]])
     apply = partial(updates.with_missing, UPDATES[name], x, h)
     analysis = apply(y, noise, rng=rng())
@@ -68,6 +71,7 @@ def test_missing_components_in_a_stack_with_several_covariances(name: str) -> No
     assert (analysis[2] == x[2]).all()
     assert (analysis[1] != x[1]).any()
     assert np.allclose(analysis[0], complete[0], rtol=0, atol=1e-12)
+    # The first two ensembles exchange their observations.
     swapped = apply(y[[1, 0, 2]], noise, rng=rng())
     assert np.allclose(swapped[1], complete[1], rtol=0, atol=1e-12)
 
@@ -92,6 +96,7 @@ def test_the_options_of_a_partial_are_kept_and_checked() -> None:
     assert np.array_equal(unchecked, ETKF(*data, rng=rng()))
     assert has_tag(ETKF, "stacks")
     assert not has_tag(partial(print, 3), "stacks")
+    # A function without the decorator has no tags.
     plain = updates.with_inflation(lambda x, h, y, r, *, rng: x, factor=1.0)
     assert not has_tag(plain, "stacks")
     with pytest.raises(ValueError, match="rotation"):
@@ -120,6 +125,7 @@ def test_calls_inside_a_user_s_update_are_checked() -> None:
 
     x = members(5)
     inflated = updates.with_inflation(transform, factor=1.1)
+    # "simplex" is no solver: the mistake is the user's, in every wrapper.
     for update in (transform, inflated, partial(updates.with_missing, inflated)):
         with pytest.raises(ValueError, match="^solver must"):
             update(x, x @ H.T, Y, R, rng=rng())
@@ -137,10 +143,13 @@ def test_serial_updates_without_a_sensor_are_exact_for_linear_observations() -> 
     x = members(20, 2)
     diagonal = np.diag([0.5, 0.9])
     update = updates.serially(updates.enkf_exact)
-    for noise in (np.stack([diagonal, 2 * diagonal]), np.stack([diagonal, R])):
+    independent = np.stack([diagonal, 2 * diagonal])
+    correlated = np.stack([diagonal, R])
+    for noise in (independent, correlated):
         analysis = update(x, x @ H.T, [Y, Y], noise, rng=rng())
         for k in range(2):
-            mean, cov = kalman(*moments(x[k]), H, noise[k], Y)
+            prior_mean, prior_cov = moments(x[k])
+            mean, cov = kalman(prior_mean, prior_cov, H, noise[k], Y)
             assert np.allclose(analysis[k].mean(axis=0), mean, atol=1e-12)
             assert np.allclose(np.cov(analysis[k].T), cov, atol=1e-12)
 
@@ -156,11 +165,14 @@ def test_serial_updates_predict_again() -> None:
     data = (x, predict(x), y, np.diag([0.5, 0.9]))
     update = updates.serially(ETKF)
     analysis = update(*data, rng=rng(), predict=predict)
-    first = ETKF(x, predict(x)[:, :1], y[:1], [[0.5]], rng=rng())
-    second = ETKF(first, predict(first)[:, 1:], y[1:], [[0.9]], rng=rng())
+    h = predict(x)[:, :1]
+    first = ETKF(x, h, y[:1], [[0.5]], rng=rng())
+    h = predict(first)[:, 1:]
+    second = ETKF(first, h, y[1:], [[0.9]], rng=rng())
     assert np.allclose(analysis, second, atol=1e-13)
     # Predictions that move along with the members differ, since h is not linear.
-    assert np.abs(update(*data, rng=rng()) - analysis).max() > 1e-3
+    without_predict = update(*data, rng=rng())
+    assert np.abs(without_predict - analysis).max() > 1e-3
 
 
 # ------------------------------------------------------------------------------ forecasts
@@ -181,7 +193,8 @@ def test_exact_forecast_adds_q_exactly() -> None:
     forecast = exact_forecast(x, nonlinear, 0.0, 0.5, rng=rng())
     steps = nonlinear.step(x, 0.0, 0.5)
     for k in range(3):
-        assert np.allclose(forecast[k].mean(axis=0), steps[k].mean(axis=0), atol=1e-13)
+        expected = steps[k].mean(axis=0)
+        assert np.allclose(forecast[k].mean(axis=0), expected, atol=1e-13)
         expected = np.cov(steps[k].T) + 0.5 * q
         assert np.allclose(np.cov(forecast[k].T), expected, atol=1e-12)
     # A failed ensemble does not change the draws of the others.
@@ -198,7 +211,8 @@ def test_stochastic_forecast_adds_q_on_average() -> None:
     model = Model(2, lambda x, t, dt: x @ phi.T, lambda t, dt: dt * q)
     x = members(100_000)[:, :2]
     forecast = updates.stochastic_forecast(x, model, 0.0, 0.5, rng=rng())
-    expected = phi @ np.cov(x.T) @ phi.T + 0.5 * q
+    propagated = phi @ np.cov(x.T) @ phi.T
+    expected = propagated + 0.5 * q
     assert np.allclose(np.cov(forecast.T), expected, atol=0.03)
 
 
@@ -244,7 +258,9 @@ def test_augmentation_is_one_more_observation(update: Update) -> None:
     """|q|² is observed as L² = 1.44 with independent noise of the given deviation."""
     x = swings()
     positions = x[:, :2]
-    predicted = np.column_stack([positions, (positions**2).sum(axis=1)])
+    squares = (positions**2).sum(axis=1)
+    predicted = np.column_stack([positions, squares])
+    # Block diagonal: R of the sensor, and σ² of the constraint
     noise = np.zeros((3, 3))
     noise[:2, :2] = NOISE
     noise[2, 2] = 0.2**2
@@ -265,13 +281,16 @@ def test_the_taper_is_a_correlation_that_ends_at_two_radii() -> None:
     step = 1e-3
     for joint, power in ((1.0, 1), (2.0, 3)):
         centre = gaspari_cohn(np.array(joint))
-        before, after = gaspari_cohn(joint + np.array([-step, step])) - centre
+        sides = joint + np.array([-step, step])
+        before, after = gaspari_cohn(sides) - centre
         assert abs(before + after) < step**power
     points = np.arange(40.0)
     on_line = np.abs(np.subtract.outer(points, points))
     on_ring = np.minimum(on_line, 40 - on_line)
+    # A correlation matrix is positive semidefinite.
     for distance in (on_line, on_ring):
-        assert np.linalg.eigvalsh(gaspari_cohn(distance / 5)).min() > -1e-12
+        taper = gaspari_cohn(distance / 5)
+        assert np.linalg.eigvalsh(taper).min() > -1e-12
 
 
 def test_a_single_observation_is_localised_by_a_tapered_gain() -> None:
@@ -280,9 +299,11 @@ def test_a_single_observation_is_localised_by_a_tapered_gain() -> None:
     places = np.array([[0.0], [1.5], [7.0]])
     observation_places = np.array([[0.5]])
     zeta = np.sqrt(0.5) * rng(3).standard_normal((20, 1))
-    rho = gaspari_cohn(np.abs(places - observation_places)[:, 0] / 2)
+    distances = np.abs(places - observation_places)[:, 0]
+    rho = gaspari_cohn(distances / 2)
     covariance = np.cov(x.T)
-    gain = rho * covariance[:, 0] / (covariance[0, 0] + 0.5)
+    innovation_variance = covariance[0, 0] + 0.5
+    gain = rho * covariance[:, 0] / innovation_variance
 
     def update_with_seed(*data: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         return updates.enkf(*data, rng=np.random.default_rng(3))
@@ -294,7 +315,8 @@ def test_a_single_observation_is_localised_by_a_tapered_gain() -> None:
         radius=2.0,
     )
     analysis = local(x, x[:, :1], [1.0], [[0.5]], rng=rng())
-    expected = x + (1.0 - x[:, :1] - zeta) * gain
+    innovations = 1.0 - x[:, :1] - zeta
+    expected = x + innovations * gain
     assert np.allclose(analysis, expected, atol=1e-12)
     # The third component is farther than two radii.
     assert (analysis[:, 2] == x[:, 2]).all()
@@ -325,8 +347,10 @@ def test_localised_observations_on_a_ring_are_assimilated_in_turn(
     noise = np.diag([0.5, 0.9])
     update = localize_on_ring([0, 2])
     analysis = update(x, x[:, [0, 2]], y, noise, rng=rng(), **options)
-    first = localize_on_ring([0])(x, x[:, :1], y[:1], [[0.5]], rng=rng())
-    second = localize_on_ring([2])(first, first[:, 2:], y[1:], [[0.9]], rng=rng())
+    update_first = localize_on_ring([0])
+    first = update_first(x, x[:, :1], y[:1], [[0.5]], rng=rng())
+    update_second = localize_on_ring([2])
+    second = update_second(first, first[:, 2:], y[1:], [[0.9]], rng=rng())
     assert np.allclose(analysis, second, atol=1e-12)
 
 

@@ -13,6 +13,7 @@ __all__ = ["digest", "of_axes"]
 
 Array = NDArray[np.float64]
 
+# k times the golden ratio, modulo 1, is spread evenly and never repeats.
 _GOLDEN = (np.sqrt(5) - 1) / 2
 _OFFSET = 0.03183098861837907
 """Moves the ties of rounding away from short decimals, which are frequent in plots (1/10π)."""
@@ -30,6 +31,7 @@ def _round(value: float, scale: float, *, max_decades: int) -> str:
     # Four digits of the value, or fewer if they would be finer than the scale allows.
     unit = 10.0 ** max(_decade(abs(value)) - 3, _decade(scale) - max_decades)
     steps = np.floor(value / unit + 0.5 + _OFFSET)
+    # Adding 0.0 turns -0.0 into 0.0, which prints without a sign.
     return f"{steps * unit + 0.0:.4g}"
 
 
@@ -48,6 +50,7 @@ def _projection(values: Array) -> float:
 def _summary(values: Array) -> str:
     """Describe an array: size, range, mean, projection, and how many entries are not finite."""
     flat = values.ravel()
+    # One NaN would make every number of the summary NaN.
     is_finite = np.isfinite(flat)
     n_nan = int(np.isnan(flat).sum())
     n_infinite = int(np.isinf(flat).sum())
@@ -134,6 +137,7 @@ def of_axes(drawn: Any) -> str:
     """
     texts: list[str] = []
     for k, axes in enumerate(_panels(drawn), start=1):
+        # The head counts the artists of each kind: a missing curve changes it.
         entries = list(_entries(axes))
         counts: dict[str, int] = {}
         for kind, n, _ in entries:
@@ -163,6 +167,7 @@ def _describe_entries(entries: list[_Entry]) -> list[str]:
         name = f"{kind} {first}" if n <= 1 else f"{kind} {first}-{counts[kind]}"
         summaries = {axis: _summary(values) for axis, values in coordinates.items()}
         for axis, text in summaries.items():
+            # Curves of one panel mostly share their x.
             if previous.get(axis) != text:
                 lines.append(f"{name} {axis}: {text}")
         previous = summaries
@@ -187,8 +192,10 @@ def _panels(drawn: Any) -> Iterator[Any]:
 
 def _entries(axes: Any) -> Iterator[_Entry]:
     """Yield the visible artists of an axes; a row of patches, such as bars, is one."""
+    # Values as given to matplotlib, before any scaling of the axes
     for line in _visible(axes.lines):
         yield "line", 1, _by_axis(*np.transpose(line.get_xydata()))
+    # Bars of a histogram are many patches of one kind in a row.
     for _, group in groupby(_visible(axes.patches), key=type):
         patches = list(group)
         # Outlines in the units of the data: the path of the unit shape, transformed.

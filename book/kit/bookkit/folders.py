@@ -35,6 +35,7 @@ def inside(folder: Path, paper: str, name: str, suffix: str) -> Path:
     Traceback (most recent call last):
     ValueError: name must be one of table-2, table-3, got '../das/pendulum'
     """
+    # Only existing names pass, so that no name leads out of the folder.
     papers = ["", *sorted(p.name for p in folder.iterdir() if p.is_dir())]
     if paper not in papers:
         raise ValueError(f"paper must be one of {', '.join(papers[1:])}, got {paper!r}")

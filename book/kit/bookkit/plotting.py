@@ -220,6 +220,7 @@ def ellipse(
     root = factor(np.asarray(covariance, dtype=float))
     radius = np.sqrt(-2 * np.log1p(-level))
     angles = np.linspace(0, 2 * np.pi, 181)
+    # 181 points: two degrees apart, and the last is the first.
     x, y = centre[:, None] + radius * root @ np.stack([np.cos(angles), np.sin(angles)])
     ax.plot(x, y, color=colour(index), linestyle=line_style(index), label=label)
     ax.plot(*centre, marker="+", color=colour(index), linestyle="none")
@@ -258,6 +259,7 @@ def band(
     ... ].get_ydata()
     array([2., 4.])
     """
+    # The median and the band are of each time, not of a whole run.
     low, middle, high = np.quantile(
         np.asarray(runs), [quantiles[0], 0.5, quantiles[1]], axis=0
     )
@@ -328,6 +330,7 @@ def graph(
                 fontsize="small",
                 zorder=3,
             )
+    # Discs stay round, and no axis is shown: positions mean nothing.
     ax.set_aspect("equal")
     ax.margins(0.2)
     ax.set_axis_off()

@@ -134,6 +134,7 @@ class Verdict:
     range: str = ""
 
     def __post_init__(self) -> None:
+        # "match" must not be possible for a table that is only read.
         allowed = VERDICTS[_find_item(self.paper, self.item).kind]
         if self.verdict not in allowed:
             raise ValueError(
@@ -155,6 +156,7 @@ class Verdict:
     def _repr_mimebundle_(
         self, include: Any = None, exclude: Any = None
     ) -> dict[str, Any]:
+        # Text for comparisons, HTML for the page, JSON for the ledger
         return {
             "text/plain": str(self),
             "text/html": html_table(
@@ -251,6 +253,7 @@ class Claim(NamedTuple):
         ... )
         order holds: ratio 0.8
         """
+        # The same rule on the null's number: a rule that passes both has no power.
         null_text = f"{against}: {shown(null)}{' (holds too)' if rule(null) else ''}"
         return cls(
             id, text, bool(rule(ours)), shown(ours), null_text, not rule(null), range
@@ -309,12 +312,14 @@ def judge_claims(
     """
     listed_item = _find_item(paper, item)
     file = (
+        # Claims about a table stand beside its printed values, in a file of their own.
         listed_item.file
         if listed_item.file.startswith("figure")
         else f"{listed_item.file}-claims"
     )
     listed = {row["id"]: row for row in table(paper, file)}
     ids = [claim.id for claim in claims]
+    # No claim may be left out because it fails.
     if sorted(ids) != sorted(listed):
         raise ValueError(
             f"claims must be those of {paper} {item}, {', '.join(listed)}, each once, "
@@ -377,6 +382,7 @@ def judge_parameters(
     """
     listed_item = _find_item(paper, item)
     printed = table(paper, listed_item.file)
+    # Of a recorded scenario, only the cells that the study read
     rows = read.cells() if isinstance(read, Scenario) else read
     # Without a scenario, the recorded one says whether it was changed.
     study = read if scenario is None and isinstance(read, Scenario) else scenario
@@ -406,6 +412,7 @@ _PRINTED_KINDS = {
 def _same(a: str, b: str) -> bool:
     """Return whether two cells are equal as numbers, or as texts without spaces."""
     try:
+        # "0.20" and "0.2" are the same number.
         return float(a) == float(b)
     except ValueError:
         return re.sub(r"\s+", "", a) == re.sub(r"\s+", "", b)

@@ -18,9 +18,11 @@ def read_rows(path: Path) -> list[dict[str, str]]:
     Raises an error that names the file if a row has more or fewer cells than the first line.
     """
     with path.open(encoding="utf-8", newline="") as lines:
+        # strict: a stray quote is an error instead of a part of the text.
         reader = csv.DictReader(lines, strict=True)
         rows = list(reader)
     for number, row in enumerate(rows, start=1):
+        # DictReader puts cells beyond the header under None, and None for missing ones.
         if None in row or None in row.values():
             raise ValueError(
                 f"{path.name}, row {number}: must have as many cells as the first line"
@@ -35,6 +37,7 @@ _CELL = "text-align:left;vertical-align:top;padding:.1em .8em .1em 0"
 def html_table(columns: Sequence[str], rows: Rows) -> str:
     """Return rows as an HTML table with three rules."""
 
+    # Styles stand in the cells, since a notebook outside the book has no style sheet.
     def cells(tag: str, texts: Sequence[str]) -> str:
         return "".join(
             f'<{tag} style="{_CELL}">{html.escape(t)}</{tag}>' for t in texts
@@ -52,6 +55,7 @@ def markdown_table(columns: Sequence[str], rows: Rows) -> str:
     """Return rows as a Markdown table."""
 
     def line(texts: Sequence[str]) -> str:
+        # A bar would end the cell.
         escaped = [t.replace("\\", "\\\\").replace("|", "\\|") for t in texts]
         return f"| {' | '.join(escaped)} |"
 

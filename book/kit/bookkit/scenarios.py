@@ -89,6 +89,7 @@ def _check_origin(cells: Mapping[str, Any]) -> None:
         raise ValueError(
             f"source must be one of {', '.join(_SOURCES)}, got {cells.get('source')!r}"
         )
+    # A given value needs its place in the paper, any other one a reason.
     needed = "where" if cells["source"] == "given" else "reason"
     for key in ("name", "unit", needed):
         if not str(cells.get(key) or "").strip():
@@ -104,6 +105,7 @@ class UnknownKey(KeyError, ValueError):
     """A scenario or a row has no such name; the message lists the nearest names."""
 
     def __init__(self, text: str, key: Any, names: list[str]) -> None:
+        # A misspelt name is answered with the names that look like it.
         nearest = get_close_matches(str(key), names, n=3, cutoff=0.4) or names[:3]
         super().__init__(f"{text} {key!r}; nearest: {', '.join(nearest) or 'none'}")
 
@@ -239,6 +241,7 @@ class Scenario:
 
     def __getitem__(self, key: str) -> Any:
         value = self.parameter(key).value
+        # A list of texts stays a tuple.
         if not isinstance(value, tuple) or isinstance(value[0], str):
             return value
         # Numbers become an array that a study cannot change.
@@ -265,12 +268,14 @@ class Scenario:
     @property
     def adjacency(self) -> NDArray[np.float64]:
         """The communication graph, (A, A): 1 for a link of ``neighbours``; no links to oneself."""
+        # A paper may list an agent among its own neighbours: no link to itself.
         names = [row["name"] for row in self.agents]
         links = [[float(a in row["neighbours"]) for a in names] for row in self.agents]
         return np.array(links) * (1 - np.eye(len(names)))
 
     def replace(self, **values: Any) -> Scenario:
         """Return the scenario with other values of some parameters; their origins stay."""
+        # `parameter` refuses a name that the scenario does not have.
         changed = {
             key: replace(self.parameter(key), value=value)
             for key, value in values.items()
@@ -300,6 +305,7 @@ class Scenario:
         for parameter in self.parameters.values():
             entries[parameter.name] = f"{_json(parameter.value)} {parameter.unit}"
         for table, rows in self.tables.items():
+            # The names, in order: adding or removing an agent is a change.
             entries[table] = _json([row["name"] for row in rows])
             for row in rows:
                 for column in row.value_columns:
@@ -344,6 +350,7 @@ class Scenario:
             ]
             tables += [([head, "value", *origin], texts)] if texts else []
         for name, rows in self.tables.items():
+            # The union of all rows' columns, in the order in which they appear.
             columns = list(dict.fromkeys(c for row in rows for c in row.value_columns))
             # Name and unit have columns of their own, at fixed places.
             columns = [c for c in columns if c not in ("name", "unit")]
@@ -406,10 +413,12 @@ def read_scenario(path: Path) -> Scenario:
     # The entry that an error names; before the first one, the form of the file
     entry = "its form"
     try:
+        # Every error below is raised again with the file's and the entry's name.
         data = tomllib.loads(path.read_text(encoding="utf-8"))
         title = data.pop("title")
         groups: dict[str, dict[str, Parameter]] = {"parameters": {}, "notes": {}}
         for group in groups:
+            # Arrays of tables remain in `data`.
             for name, cells in data.pop(group, {}).items():
                 entry = f"[{group}.{name}]"
                 groups[group][name] = Parameter(name, **cells)

@@ -63,6 +63,7 @@ class Slider:
     start: int
 
     def __post_init__(self) -> None:
+        # A page must stay light, also on a phone.
         if len(self.html) > LIMIT:
             raise ValueError(
                 f"frames must have at most {LIMIT} characters of HTML, got {len(self.html)}"
@@ -89,6 +90,7 @@ class Slider:
         return _PAGE.substitute(
             # A hash of the digests: the frames' bytes may differ between machines.
             key=hashlib.sha256(repr(self).encode()).hexdigest()[:16],
+            # Texts of the author must not end an attribute or an element.
             label=html.escape(self.label),
             first=pictures[self.start],
             alt=html.escape(f"{self.alt} {self.labels[self.start]}."),
@@ -105,6 +107,7 @@ class Slider:
     ) -> dict[str, str]:
         # Print and notebooks without scripts show the first frame as a PNG.
         still = io.BytesIO()
+        # Fast compression: the stored notebook is compressed again.
         Image.open(io.BytesIO(self.frames[self.start])).save(
             still, "png", compress_level=1
         )
@@ -166,6 +169,7 @@ def slider(
         f"{label} {format(value, form)} {unit or ''}".rstrip() for value in values
     )
     positions: list[Any] = []
+    # The first call fills `positions`, the later ones use them.
     frames, sizes, digests = zip(
         *(_frame(draw(v), positions) for v in values), strict=True
     )

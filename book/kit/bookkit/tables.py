@@ -54,6 +54,7 @@ class ResultTable:
         for name in self.frame:
             # The smallest or largest number of a column, which is set in bold
             best = self.frame[name].agg(self.best[name]) if name in self.best else None
+            # Ties are all bold.
             pairs = zip(self.frame[name], map(escape, self._format(name)), strict=True)
             cells[name] = [f"<b>{t}</b>" if value == best else t for value, t in pairs]
         page = self.frame.assign(**cells).to_html(escape=False, border=0)

@@ -110,6 +110,7 @@ def check(
         allowed[name] = max(atol, float(np.ptp(finite)) if finite.size else 0.0)
     study = run(
         trial,
+        # The stored seeds, not the script's: a file can be checked on its own.
         [stored.seed(i) for i in chosen],
         errors="collect",
         workers=workers,
@@ -167,6 +168,7 @@ def _report(stored: Stored, trial: Trial, differences: list[str]) -> str:
     lines = differences[:5]
     if len(differences) > 5:
         lines.append(f"and {len(differences) - 5} more")
+    # Changed code explains a difference better than changed versions.
     was = stored.metadata["code"].get(plain(trial).__qualname__)
     now = fingerprint(trial) if was else ""
     if was and was != now:

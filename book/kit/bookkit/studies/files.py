@@ -85,6 +85,7 @@ class Stored:
 def seed_text(seed: SeedSequence | int) -> str:
     """Return a seed's entropy and spawn key, in the form of a file."""
     sequence: Any = fresh(seed)
+    # An entropy may be one integer or a list of them.
     words = (
         sequence.entropy
         if isinstance(sequence.entropy, Sequence)
@@ -205,6 +206,7 @@ def store(
             or ",".join(text.split(",")[1 : n_head - 1]) != texts[i]
         ):
             raise ValueError(f"{part.path}: its trial {i} has another seed: remove it")
+    # Trials that are done, by an earlier call or another machine, do not run again.
     chosen = range(len(seed_sequences)) if indices is None else indices
     items = [(i, seed_sequences[i]) for i in chosen if i not in rows]
     # Deaths of workers are not stored: they may be the fault of the machine.
@@ -248,6 +250,7 @@ class _Part:
         if not self.path.is_file():
             return {}
         text = self.path.read_text(encoding="utf-8", errors="replace")
+        # The process ended while it wrote the head: nothing is lost.
         if self.head.startswith(text):  # truncated before its first row
             self.path.unlink()
         elif not text.startswith(f"{self.head}\n"):
@@ -258,6 +261,8 @@ class _Part:
         rows = {}
         for line in text[len(self.head) :].split("\n"):
             row, _, checksum = line.rpartition(",")
+            # The checksum tells a complete row from one that a full disk or a crash cut
+            # off.
             if row and checksum == _checksum(row):
                 rows[int(row.split(",")[0])] = row
         return rows
@@ -271,6 +276,7 @@ class _Part:
         with _name_file(self.path), self.path.open("ab") as file:
             file.write(text.encode())
             file.flush()
+            # fsync is slow on a shared disk, so it is called for many rows at once.
             if time.monotonic() - self.synced > _SYNC_SECONDS:
                 os.fsync(file.fileno())
                 self.synced = time.monotonic()
@@ -285,6 +291,7 @@ class _Part:
                 file.write(_FORMAT + b"\n" + _seal(body) + b"\n" + body)
                 file.flush()
                 os.fsync(file.fileno())
+            # Readers see the old file or the new one, never a part.
             os.replace(new, self.target)
         finally:
             new.unlink(missing_ok=True)
@@ -329,6 +336,7 @@ def merge(path: str | Path, *parts: str | Path) -> Path:
         other = _Part(Path(path), head[0])
         other.path = Path(source)
         for i, row in other.rows().items():
+            # Machines may have run the same trial; their rows must be equal.
             if rows.setdefault(i, row) != row:
                 raise ValueError(f"{source}: its trial {i} differs from another part's")
             merged.append(row)
@@ -351,6 +359,7 @@ def load(path: str | Path) -> Stored:
     import pandas
 
     source = Path(path)
+    # Three parts: format, checksum of the rest, and the rest
     form, seal, body = (source.read_bytes().split(b"\n", 2) + [b"", b""])[:3]
     if form != _FORMAT or seal != _seal(body):
         raise ValueError(f"path: {source} is damaged, or was not written by store")

@@ -70,6 +70,7 @@ def fresh(seed: SeedSequence | int) -> SeedSequence:
     """Return a copy of a seed from which nothing has been spawned."""
     if not isinstance(seed, SeedSequence):
         return SeedSequence(seed)
+    # Spawning changes a seed's counter; a copy starts at zero again.
     return SeedSequence(seed.entropy, spawn_key=seed.spawn_key)
 
 
@@ -226,6 +227,8 @@ def _study(seeds: tuple[SeedSequence, ...], results: Mapping[int, Outcome]) -> S
         if outcome.kind:
             failures.append(Failure(i, seeds[i], outcome.kind, outcome.text))
         else:
+            # Values stay pickled until here, so that the parent is not slowed while
+            # trials run.
             values[i] = pickle.loads(outcome.value)
             done[i] = True
     return Study(seeds, tuple(values), tuple(failures), done)
@@ -246,6 +249,7 @@ def track(items: Iterable[Any], total: int, show: bool) -> Iterable[Any]:
 
 # Functions of a worker.
 
+# A forked process inherits this name, hence the process number beside it.
 _HOME = uuid.uuid4().hex
 
 
@@ -322,6 +326,7 @@ def _start(*_: str) -> None:
 def _end_with_parent(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(0.5)
+    # Without the usual clean-up, which would wait for the running trial.
     os._exit(1)
 
 
@@ -344,6 +349,7 @@ def _pool(workers: int) -> Executor:
 
 def slots(executor: Executor) -> int:
     """Return how many calls an executor runs at a time, on its cluster or this machine."""
+    # A cluster of Dask grows and shrinks: its workers' threads are counted.
     client = getattr(executor, "_client", None)
     if client:  # dask
         return max(1, int(sum(client.nthreads().values())))
@@ -352,6 +358,7 @@ def slots(executor: Executor) -> int:
 
 def pickle_by_value(folder: Path) -> None:
     """Let functions of modules in a folder be sent by value: workers need not have the folder."""
+    # Packages are installed everywhere; single files beside the script are not.
     for module in list(sys.modules.values()):
         file = getattr(module, "__file__", None)
         if (
@@ -401,6 +408,7 @@ def outcomes(
     job = (_pickle_trial(trial), home(), versions())
     with _single_threaded():
         if executor is None and workers == 1:
+            # One worker: in this process, without an executor.
             for item in items:
                 yield from chunk(job, [item])[1]
             return
@@ -521,4 +529,5 @@ class _Flight:
             future.cancel()
         if self.owns_executor and self.in_flight:
             stop: Any = self.executor.shutdown
+            # A running trial would keep its worker busy after the study has ended.
             stop(wait=True, kill_workers=True)
