@@ -334,7 +334,8 @@ def deviations(cov: Array) -> Array:
     array([2., 0.])
     """
     # A variance may be negative by rounding.
-    return np.asarray(np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1).clip(0.0)))
+    variances = cov.diagonal(axis1=-2, axis2=-1)
+    return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
 
 def to_unit_variances(cov: Array) -> tuple[Array, Array]:

@@ -18,8 +18,26 @@ from .validation import Array, InvalidArgumentError
 from .validation.first_use import mark_checked, needs_check
 
 if TYPE_CHECKING:
-    from .models import Model
-    from .sensors import Sensor
+    from typing import Protocol
+
+    class _Model(Protocol):
+        """The parts of a model that are used here, in a layer below the models."""
+
+        @property
+        def periods(self) -> Any: ...
+        @property
+        def names(self) -> Sequence[str]: ...
+        def step(self, x: Array, t: float, dt: float) -> Array: ...
+        def jacobian(self, x: Array, t: float, dt: float) -> Array: ...
+
+    class _Sensor(Protocol):
+        """The parts of a sensor that are used here."""
+
+        @property
+        def kind(self) -> str: ...
+        def predict(self, x: Array, previous: Array | None = None) -> Array: ...
+        def residual(self, y: Array, expected: Array) -> Array: ...
+
 
 __all__: list[str] = []
 
@@ -226,7 +244,7 @@ def gather(
     return np.where(is_wide, wide, by_first)
 
 
-def step_members(model: Model, x: Array, t: float, dt: float) -> Array:
+def step_members(model: _Model, x: Array, t: float, dt: float) -> Array:
     """Move states (..., N, d) without noise; with declared periods they stay on one branch.
 
     >>> from distfilt.models import Model
@@ -265,7 +283,7 @@ def step_members(model: Model, x: Array, t: float, dt: float) -> Array:
     return gather(values, bring_near, tangent, fallback)
 
 
-def check_transition(model: Model, x: Array, t: float, dt: float) -> None:
+def check_transition(model: _Model, x: Array, t: float, dt: float) -> None:
     """Refuse periods that do not belong to a model: states a period apart must move alike."""
     if not needs_check(model, "periods"):
         return
@@ -286,7 +304,7 @@ def check_transition(model: Model, x: Array, t: float, dt: float) -> None:
 
 
 def check_sensor(
-    sensor: Sensor, model: Model, states: Array, previous: Array | None = None
+    sensor: _Sensor, model: _Model, states: Array, previous: Array | None = None
 ) -> None:
     """Refuse a sensor whose observation of a circular component lacks a period, once.
 
@@ -317,22 +335,26 @@ def check_sensor(
             )
 
 
-def name_component(model: Model, place: int) -> str:
+def name_component(model: _Model, place: int) -> str:
     """Return a component's name, or its number."""
     return model.names[place] if model.names else str(place)
 
 
 def warn_of_wrapping(
-    model: Model, x: Array, values: Array, t: float, dt: float
+    model: _Model, x: Array, values: Array, t: float, dt: float
 ) -> None:
     """Warn once if a model without periods wraps a component that its members straddle.
 
     `x` and `values` (..., N, d) are members before and after the forecast.
     """
-    # A cheap test first: of some members, one lies more than half a turn from another.
-    some = values[..., :: max(1, values.shape[-2] // 16), :]
-    is_wide = some.max(axis=-2) - some.min(axis=-2) > np.pi
-    if not is_wide.any() or not needs_check(model, "wrapping"):
+    # A cheap test first: of some members, those near each other come far apart.
+    stride = max(1, values.shape[-2] // 16)
+    some = values[..., ::stride, :]
+    is_torn = some.max(axis=-2) - some.min(axis=-2) > np.pi
+    if is_torn.any():
+        some = x[..., ::stride, :]
+        is_torn &= some.max(axis=-2) - some.min(axis=-2) < 0.5 * np.pi
+    if not is_torn.any() or not needs_check(model, "wrapping"):
         return
     jumps = values - values[..., :1, :]
     is_narrow = np.ptp(x, axis=-2) < 0.5 * np.pi
@@ -371,7 +393,7 @@ def warn_of_wrapped_truth(f: Any, mean: Array, truth: Array) -> None:
     mean : ndarray, (T, *runs, A, d)
     truth : ndarray, (T, *runs, 1 or A, d)
     """
-    if not getattr(f, "notices_wrapping", False) or len(mean) < 2:
+    if not getattr(f, "lacks_periods", False) or len(mean) < 2:
         return
     with np.errstate(invalid="ignore"):
         error = mean - truth

@@ -26,6 +26,7 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in PATHS}
 # A module imports only from layers below its own, or from its own subpackage.
 LAYERS = (
     ("validation",),
+    ("derivatives", "periods"),
     ("linalg",),
     ("ensembles", "gaussians"),
     ("models",),
@@ -173,11 +174,14 @@ def test_dir_lists_subpackages_and_their_public_names() -> None:
 
 
 def run(code: str, path: Path | None = None) -> str:
-    """Run code in a fresh interpreter, outside the repository; return its standard output."""
+    """Run code in a fresh interpreter, outside the repository; return its standard output.
+
+    It imports the library of this repository, or of `path`, and nothing of the folder it runs in.
+    """
     result = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code],
+        [sys.executable, "-P", "-W", "error", "-c", code],
         cwd=path or ROOT.parent,
-        env={**os.environ, "PYTHONPATH": str(path or "")},
+        env={**os.environ, "PYTHONPATH": str(path or ROOT)},
         capture_output=True,
         text=True,
     )

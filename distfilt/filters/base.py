@@ -25,7 +25,7 @@ from typing import (
 
 import numpy as np
 
-from ..models import Model
+from ..models import LinearModel, Model
 from ..network import Channel, Faults, Ledger
 from ..network.channel import kind_of_rule
 from ..network.graphs import Graph, as_graph
@@ -345,7 +345,11 @@ class Filter(FrozenModel, ABC, Generic[S]):
         if repeated:
             step.warn_once("repeated", _describe_repetition(repeated[0]))
         if has_sensors and (is_single or matched):
-            self._warn_of_degrees(step, [*read, matched] if is_single else [matched])
+            unplanned = [*read, matched] if is_single else [matched]
+            # Angles below four turns need no closer look.
+            large = [o for part in unplanned for o in part if (abs(o.value) > 25).any()]
+            if large:
+                self._warn_of_degrees(step, large)
         try:
             return self.next_state(step)
         except RECOVERABLE as error:
@@ -355,13 +359,10 @@ class Filter(FrozenModel, ABC, Generic[S]):
             raise FilterError((), None, t, error) from error
 
     def _warn_of_degrees(
-        self, step: Step[S], observations: Iterable[Sequence[Observation]]
+        self, step: Step[S], observations: Sequence[Observation]
     ) -> None:
         """Warn once of angles in degrees, in observations that are not part of a plan."""
-        observed = [o for entries in observations for o in entries]
-        # Angles below four turns need no closer look.
-        large = [o for o in observed if (abs(o.value) > 25).any()]
-        text = find_degrees(self, large) if large else None
+        text = find_degrees(self, observations)
         if text is not None:
             step.warn_once("degrees", text)
 
@@ -603,10 +604,15 @@ class SensorFilter(Filter[S]):
         return cast(Periods, self.model.periods)
 
     @cached_property
-    def notices_wrapping(self) -> bool:
-        """Whether angles are observed, but none is declared: then a wrapping model is noticed."""
+    def lacks_periods(self) -> bool:
+        """Whether angles are observed, but no component is declared circular."""
         observes = any(s.wraps for sensors in self.agent_sensors for s in sensors)
         return observes and not self.periods
+
+    @cached_property
+    def notices_wrapping(self) -> bool:
+        """Whether a transition that wraps is looked for; a matrix cannot wrap."""
+        return self.lacks_periods and not isinstance(self.model, LinearModel)
 
     @cached_property
     def n_agents(self) -> int:

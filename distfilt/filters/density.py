@@ -303,6 +303,8 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
         # The graph depends on the positions, so the channel is made here.
         graph = self._graph_at(snapshot, state.t, t)
         channel = Channel(graph, ledger=state.ledger, faults=self.faults, t=t)
+        # Agents move, drop out and wait for an exchange: the record has the number of parts.
+        channel.expects_parts = True
         step.channel = channel
         memory, densities, counts = self.fusion.update(
             state.carried, snapshot, channel, dt

@@ -280,6 +280,16 @@ class EnsembleFilter(
         """Whether the update accepts ensembles with a noise covariance of their own each."""
         return has_tag(self.update, "stacks")
 
+    @cached_property
+    def _weights_members(self) -> bool:
+        """Whether the update weights members by the likelihoods of their predictions."""
+        return has_tag(self.update, "weights_members")
+
+    @cached_property
+    def _locates(self) -> bool:
+        """Whether the update needs the places of the observations."""
+        return has_tag(self.update, "locates")
+
     def initial_state(
         self, prior: Prior, runs: tuple[int, ...], rng: Any
     ) -> dict[str, Any]:
@@ -297,8 +307,9 @@ class EnsembleFilter(
                 self.forecast, ensembles, self.model, state.t, step.dt, rng=step.rng
             )
             _check_shape(ensembles, "forecast", state.ensembles.shape)
-            # A forecast of the user's own may wrap.
-            ensembles = fold_torn(ensembles, self.periods)
+            if self.periods:
+                # A forecast of the user's own may wrap.
+                ensembles = fold_torn(ensembles, self.periods)
             if self.notices_wrapping:
                 warn_of_wrapping(
                     self.model, state.ensembles, ensembles, state.t, step.dt
@@ -308,9 +319,15 @@ class EnsembleFilter(
         for place, group in step.received():
             self._condition(stack, place, group, step)
         # Agents exchange beliefs after the update, through the same channel.
-        fused = fuse_members(step, stack[-1])
-        past = [settle(x, self.periods) for x in regress_past(stack, fused)]
-        return step.end(ensembles=settle(fused, self.periods), past=past)
+        fused = stack[-1]
+        past = stack[:-1]
+        if step.has_fusion:
+            fused = fuse_members(step, fused)
+            past = regress_past(stack, fused)
+        if self.periods:
+            fused = settle(fused, self.periods)
+            past = [settle(x, self.periods) for x in past]
+        return step.end(ensembles=fused, past=past)
 
     def _condition(
         self, stack: list[Array], place: int, group: Received, step: Step[EnsembleState]
@@ -319,9 +336,11 @@ class EnsembleFilter(
         rows = group.rows
         members = tuple([ensembles[..., rows, :, :] for ensembles in stack])
         # A delayed observation of the previous time has changed it in the stack.
-        previous = step.before(place, group, stack[:-1])
+        previous = None
+        if group.changes:
+            previous = step.before(place, group, stack[:-1])
         # An update by likelihoods compares every member with the observation by itself.
-        weights_members = has_tag(self.update, "weights_members")
+        weights_members = self._weights_members
         branch: Literal["mean", "each"] = "each" if weights_members else "mean"
         predicted = group.predict(members[place], previous, branch=branch)
         if not np.isfinite(predicted).all():
@@ -336,7 +355,7 @@ class EnsembleFilter(
         predict = None
         if self._repredicts and len(stack) == 1:
             predict = partial(group.predict, previous=previous, branch=branch)
-        located = self._locate_observations(group)
+        located = self._locate_observations(group) if self._locates else ()
 
         def compute(h: Array, y: Array, *args: Any) -> tuple[Array, ...]:
             *arrays, noise, rng = args
@@ -365,12 +384,10 @@ class EnsembleFilter(
             ensembles[..., rows, :, :] = new
 
     def _locate_observations(self, group: Received) -> tuple[Array, ...]:
-        """Return the places (*runs, G, M, k) of a group's observations, if the update needs them.
+        """Return the places (*runs, G, M, k) of a group's observations, if they are not common.
 
         An update with one array of places fits agents that all receive the same observations.
         """
-        if not has_tag(self.update, "locates"):
-            return ()
         locate = find_locate(self.update)
         if locate is None:
             self._check_common_places(group)
@@ -541,7 +558,8 @@ class TransportFilter(_EnsembleSummary):
             step.add_log_likelihood(total, slice(None))
         stack = self._transport(stack, logs, step)
         self._warn(logs, step)
-        stack = [settle(members, self.periods) for members in stack]
+        if self.periods:
+            stack = [settle(members, self.periods) for members in stack]
         return step.end(ensembles=stack[-1], past=stack[:-1])
 
     def reset_belief(self, state: EnsembleState, reset: Reset) -> EnsembleState:
@@ -574,7 +592,9 @@ class TransportFilter(_EnsembleSummary):
         logs = np.zeros(stack[-1].shape[:-1])
         for place, group in step.received():
             rows = group.rows
-            previous = step.before(place, group, stack[:-1])
+            previous = None
+            if group.changes:
+                previous = step.before(place, group, stack[:-1])
             members = stack[place][..., rows, :, :]
             predicted = group.predict(members, previous, branch="each")
             if not all_finite(predicted):
@@ -662,12 +682,12 @@ class TransportFilter(_EnsembleSummary):
 
 
 def fuse_members(step: Step[Any], members: Array) -> Array:
-    """Return members (*runs, A, N, d) after the fusion rule, if any, on the branch before it.
+    """Return members (*runs, A, N, d) after the fusion rule, on the branch before it.
 
     The rule gets all agents' members on one branch.
     """
     periods = step.filter.periods
-    if not periods or not step.has_fusion:
+    if not periods:
         (fused,) = step.fuse(members)
         return fused
     means = members.mean(axis=-2)

@@ -17,6 +17,7 @@ from ..validation import Array, call_user, check_array, format_number
 from .observations import Observation, sensor_of
 
 if TYPE_CHECKING:
+    from .changes import References
     from .step import Step
 
 __all__ = ["Known", "collect_observations", "fuse_beliefs"]
@@ -57,7 +58,8 @@ def collect_observations(step: Step[Any]) -> Known:
                 listed = sent[sender]
                 payload = messages[sender]
                 values = list(payload) if type(payload) is tuple else [payload]
-            _receive_changes(step, agent, listed)
+            if step.references is not None:
+                _receive_changes(step.references, step.t, agent, listed)
             # The part behind the values counts as communication alone.
             for (t, sensor), value in zip(times_and_sensors, values, strict=False):
                 if t not in by_time:
@@ -67,14 +69,11 @@ def collect_observations(step: Step[Any]) -> Known:
 
 
 def _receive_changes(
-    step: Step[Any], agent: int, observations: list[Observation]
+    references: References, t: float, agent: int, observations: list[Observation]
 ) -> None:
-    """Note which sensors' present observations an agent has, if some measure changes."""
-    references = step.references
-    if references is None:
-        return
+    """Note which sensors' observations of the present time an agent has."""
     for observation in observations:
-        if observation.t == step.t:
+        if observation.t == t:
             references.receive(agent, observation)
 
 

@@ -221,10 +221,12 @@ class GaussianFilter(
         covs = step.keep_failed(covs, unit)
         if step.has_fusion:
             means, covs = self._fuse(means, covs, step)
-        # The mean of each time by itself: a covariance does not depend on the branch.
-        n_times = means.shape[-1] // self.model.dim
+        if self.periods:
+            # The mean of each time by itself: a covariance does not depend on the branch.
+            n_times = means.shape[-1] // self.model.dim
+            means = wrap_differences(means, self.periods * n_times)
         return step.end(
-            joint_means=wrap_differences(means, self.periods * n_times),
+            joint_means=means,
             joint_covariances=symmetrise(covs),
             dim=step.state.dim,
             history=step.times[::-1],
@@ -244,8 +246,12 @@ class GaussianFilter(
         if not dt:
             return state.joint_means.copy(), state.joint_covariances.copy()
         d = state.dim
+        if self.periods or self.notices_wrapping:
+            move = partial(self._step_points, step)
+        else:
+            move = partial(model.step, t=state.t, dt=dt)
         mean, slope, extra = self._linearize(
-            partial(self._step_points, step),
+            move,
             partial(model.jacobian, t=state.t, dt=dt),
             state.means,
             state.covariances,
@@ -338,7 +344,11 @@ class GaussianFilter(
             predict, group.jacobian, mean, cov, linear
         )
         if not linear:
-            predicted = self._leave_out_unseen(predicted, slope, group, step)
+            # Mostly everything is seen, and each number depends on the state: 0 < Σ |H| < ∞.
+            steepness = np.abs(slope).sum(axis=-1)
+            is_seen = (steepness > 0) & (steepness < np.inf) & ~np.isnan(predicted)
+            if np.count_nonzero(is_seen) < is_seen.size:
+                predicted = self._leave_out_unseen(predicted, slope, group, step)
         predicted_cov = slope @ cov @ slope.mT + extra
 
         def moments(_: Array) -> tuple[Array, Array]:
@@ -408,7 +418,7 @@ class GaussianFilter(
         mean = means[..., :d]
         cov = symmetrise(covs[..., :d, :d])
         # Only the present marginal is fused, with all agents' means on one branch.
-        common = fold(mean, self.periods)
+        common = fold(mean, self.periods) if self.periods else mean
         fused_mean, fused_cov = step.fuse(common, cov)
         fused_mean = fused_mean + (mean - common) if self.periods else fused_mean
         variance = np.diagonal(fused_cov, axis1=-2, axis2=-1)

@@ -173,9 +173,11 @@ class TargetMixtureFilter(
                     scale=self.split_scale,
                 )
             noise_sqrt = model.noise_sqrt(t, dt)
-            return propagate_mixture(
-                belief, partial(self._step_points, step), noise_sqrt
-            )
+            if self.periods or self.notices_wrapping:
+                move = partial(self._step_points, step)
+            else:
+                move = partial(model.step, t=t, dt=dt)
+            return propagate_mixture(belief, move, noise_sqrt)
 
     def _step_points(self, step: Step[MixtureState], points: Array) -> Array:
         """Move the components' points (L, N, d) without noise, each component's on one branch."""

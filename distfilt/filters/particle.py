@@ -166,9 +166,12 @@ class ParticleFilter(
             everybody = np.ones(log_weights.shape[:-1], bool)
             weights = np.exp(log_weights)
             self._select(stack, log_weights, weights, everybody, offset, ancestors)
-        fused = fuse_members(step, stack[-1])
-        # The fusion moves the present particles; the earlier ones follow by regression.
-        past = regress_past(stack, fused)
+        fused = stack[-1]
+        past = stack[:-1]
+        if step.has_fusion:
+            fused = fuse_members(step, fused)
+            # The fusion moves the present particles; the earlier ones follow by regression.
+            past = regress_past(stack, fused)
         if self.periods:
             weights = np.exp(log_weights)
             fused = settle(fused, self.periods, weights)
@@ -205,7 +208,9 @@ class ParticleFilter(
     ) -> None:
         """Multiply a group's weights by the likelihood of its observations, in place."""
         rows = group.rows
-        previous = step.before(place, group, stack[:-1], origin)
+        previous = None
+        if group.changes:
+            previous = step.before(place, group, stack[:-1], origin)
         members = stack[place][..., rows, :, :]
         predicted = group.predict(members, previous, branch="each")
         if not all_finite(predicted):

@@ -165,7 +165,10 @@ def split_by_agent(prior: Any, dim: int, n_agents: int) -> list[Any] | None:
     members (N, d).
 
     >>> normal = ([0.0, 0.0], np.eye(2))
-    >>> split_by_agent(normal, 2, 2) is None, len(split_by_agent([normal, normal], 2, 2))
+    >>> (
+    ...     split_by_agent(normal, 2, 2) is None,
+    ...     len(split_by_agent([normal, normal], 2, 2)),
+    ... )
     (True, 2)
     >>> split_by_agent([normal], 2, 2)
     Traceback (most recent call last):

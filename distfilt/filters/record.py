@@ -215,8 +215,8 @@ def _collect_series(
                 numbers = [getattr(state, name) for state in states]
                 row[name] = np.array(numbers[0] if is_single else numbers)
         if isinstance(last, SensorState):
-            unseen = [_read_unseen(state, len(f.agents)) for state in states]
-            row["unseen"] = np.array(unseen[0] if is_single else unseen)
+            unseen = _read_unseen(cast(Any, states), f.n_agents)
+            row["unseen"] = unseen[0] if is_single else unseen
         if known is not None:
             index: Any = first if is_single else slice(first, first + len(block))
             values = known.values[index]
@@ -241,11 +241,16 @@ def _collect_series(
     return series, ledgers, last
 
 
-def _read_unseen(state: SensorState, n_agents: int) -> Array:
-    """Return how many observations each agent has left out in a step, (*runs, A)."""
-    if state.unseen is None:
-        return state.mask_failed(np.zeros((*state.runs, n_agents)))
-    return state.mask_failed(state.unseen)
+def _read_unseen(states: Sequence[SensorState], n_agents: int) -> Array:
+    """Return how many observations each agent has left out in each step, (T, *runs, A)."""
+    failed = np.array([state.failed for state in states])
+    result = np.zeros((*failed.shape, n_agents))
+    for numbers, state in zip(result, states, strict=True):
+        if state.unseen is not None:
+            numbers[...] = state.unseen
+    # A failed run has no numbers.
+    result[failed] = np.nan
+    return result
 
 
 def _read_nothing(

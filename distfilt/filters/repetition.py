@@ -10,7 +10,7 @@ import numpy as np
 from ..sensors import Sensor
 from .observations import Observation
 
-__all__ = ["Assimilated", "drop_repeated", "note_assimilated"]
+__all__ = ["Assimilated", "drop_repeated"]
 
 Assimilated = tuple[float, int, Any, Any, tuple[float, ...]]
 """Time, agent, sensor (its number, or itself), value and metadata of an observation."""
@@ -67,21 +67,6 @@ def drop_repeated(
 
     kept = [keep_new(of_agent) for of_agent in observations]
     return kept, keep_new(delayed), repeated
-
-
-def note_assimilated(
-    observations: Iterable[Sequence[Observation]],
-    delayed: Sequence[Observation],
-    before: Iterable[Assimilated],
-    times: Sequence[float],
-) -> tuple[Assimilated, ...]:
-    """Return the observations of the times that are kept, by copies of their values."""
-    result = [entry for entry in before if entry[0] in times]
-    for entries in (*observations, delayed):
-        for o in entries:
-            # The user may change the array before the next step.
-            result.append((o.t, o.agent, o.sensor, o.value.copy(), o.metadata))
-    return tuple(result)
 
 
 def _fingerprint(value: Any) -> tuple[tuple[int, ...], bytes]:

@@ -27,7 +27,7 @@ from .changes import Previous, References
 from .exchange import Known, collect_observations, fuse_beliefs
 from .failures import RECOVERABLE, FilterError, Row
 from .observations import Observation
-from .repetition import note_assimilated
+from .repetition import Assimilated
 from .states import SensorState, State
 
 if TYPE_CHECKING:
@@ -151,7 +151,8 @@ class Step(Generic[S]):
         self.references: References | None = None
         sources = self.filter.change_sources if isinstance(state, SensorState) else ()
         if sources:
-            self.references = References(self.state, t, observations, sources)
+            before = cast(SensorState, self.state)
+            self.references = References(before, t, observations, sources)
             times = {*self.lagged, *self.references.times}
             self.times = tuple(sorted(times))
         # Counted only with a gate.
@@ -479,14 +480,13 @@ class Step(Generic[S]):
             if "history" not in belief:
                 history = [pair for pair in pairs if pair[0] in self.lagged]
                 belief["history"] = tuple(history)
-            belief |= self._describe_observations(pairs)
+            if self.references is not None:
+                belief |= self._describe_changes(pairs, self.references)
+            belief["unseen"] = self.unseen
             belief["failed"] = self.failed
             belief["pending"] = self.pending
         if self.has_sensors:
-            kept_times = (*self.lagged, self.t)
-            belief["assimilated"] = note_assimilated(
-                self.observations, self.delayed, state.assimilated, kept_times
-            )
+            belief["assimilated"] = self._note_assimilated()
             belief["warned"] = self.warned
         # The messages in the step are in the channel's ledger.
         ledger = state.ledger if self.channel is None else self.channel.ledger
@@ -498,18 +498,27 @@ class Step(Generic[S]):
         )
         return new
 
-    def _describe_observations(
-        self, past: tuple[tuple[float, Array], ...]
+    def _describe_changes(
+        self, past: tuple[tuple[float, Array], ...], references: References
     ) -> dict[str, Any]:
-        """Return the state's fields about observations that are compared with beliefs."""
-        fields: dict[str, Any] = {"unseen": self.unseen}
-        if self.references is not None:
-            needed = self.references.kept
-            fields["last_changes"] = self.references.last_changes
-            fields["references"] = tuple(
-                [(t, x) for t, x in past if t in needed and t not in self.lagged]
-            )
-        return fields
+        """Return the state's fields about sensors of changes, and what they compare with."""
+        kept = [
+            (t, x) for t, x in past if t in references.kept and t not in self.lagged
+        ]
+        return {"last_changes": references.last_changes, "references": tuple(kept)}
+
+    def _note_assimilated(self) -> tuple[Assimilated, ...]:
+        """Return the observations of the times that are kept, by copies of their values."""
+        result = []
+        if self.lagged or self.dt == 0:
+            kept_times = (*self.lagged, self.t)
+            before = self.state.assimilated
+            result = [entry for entry in before if entry[0] in kept_times]
+        for entries in (*self.observations, self.delayed):
+            for o in entries:
+                # The user may change the array before the next step.
+                result.append((o.t, o.agent, o.sensor, o.value.copy(), o.metadata))
+        return tuple(result)
 
     # What is said once ----------------------------------------------------------------
 
@@ -780,7 +789,7 @@ class Received:
             before = None if previous is None else previous[..., part.agents, :, :]
             of_agents = states[..., part.agents, :, :]
             values = self._predict_part(part, of_agents, before)
-            if part.sensor.wraps and branch != "each":
+            if self.wraps and part.sensor.wraps and branch != "each":
                 values = _gather_predictions(part.sensor, values, of_agents, before)
             result[(..., *part.cells, slice(None))] = values.swapaxes(-1, -2)
         result = np.ascontiguousarray(result.swapaxes(-1, -2))

@@ -362,7 +362,11 @@ class LinearModel(Model):
         std: Annotated[ArrayInput, "... self.dim"] | None = None,
     ) -> Array:
         """Derivative of a step, the same matrix for all states, as (..., d, d)."""
-        return np.full((*x.shape, self.dim), self.F(dt, t))
+        if self.time_invariant:
+            phi = _transpose_transition(self, dt).T
+        else:
+            phi = self.F(dt, t)
+        return np.full((*x.shape, self.dim), phi)
 
 
 def _takes_two(function: Callable[..., Array]) -> bool:

@@ -101,6 +101,8 @@ class Channel:
         self.t = t
         # The periods of the beliefs' components, for rules of fusion: a filter sets them.
         self.periods: Periods = ()
+        # Whether a graph of several parts is expected, and no reason for a warning.
+        self.expects_parts = False
         self._ledger = Ledger.empty(self.graph.n_agents) if ledger is None else ledger
         # Losses are drawn for `_n_drawn` runs, of which this channel's are `_drawn`.
         self._n_drawn = int(np.prod(runs, dtype=np.int64))

@@ -60,8 +60,9 @@ def _warn_if_disconnected(channel: Channel, rounds: int | None = None) -> None:
 
     One round says nothing, as a graph that changes may be connected over time. Agents that
     are silent for a while may be heard later; those that are silent always have no links.
+    Where a network may fall apart, as that of a swarm, the channel says so.
     """
-    if rounds == 1:
+    if rounds == 1 or channel.expects_parts:
         return
     graph = channel.graph
     silent = channel.faults.always_silent

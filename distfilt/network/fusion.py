@@ -123,7 +123,8 @@ def covariance_intersection(
     >>> two[0].ravel().round(6), two[1].ravel().round(6)
     (array([0.6, 0.6]), array([1.2, 1.2]))
     """
-    _warn_if_disconnected(channel, rounds)
+    if rounds > 1:
+        _warn_if_disconnected(channel)
     return _intersect(belief, channel, rule, rounds, channel.periods)
 
 
@@ -160,7 +161,8 @@ def naive_fusion(
     >>> two[1].ravel().round(6)
     array([0.666667, 0.666667])
     """
-    _warn_if_disconnected(channel, rounds)
+    if rounds > 1:
+        _warn_if_disconnected(channel)
 
     def fuse(received: _Received) -> Pair:
         # All weights are one: the product of the densities.
@@ -193,7 +195,8 @@ def arithmetic_average(
     >>> two[0].ravel(), two[1].ravel()
     (array([1.5, 1.5]), array([3.75, 3.75]))
     """
-    _warn_if_disconnected(channel, rounds)
+    if rounds > 1:
+        _warn_if_disconnected(channel)
 
     def fuse(received: _Received) -> Pair:
         graph = received.graph
@@ -256,7 +259,8 @@ def consensus_pull(
            [3.]])
     """
     _warn_if_unstable(channel.graph, gain)
-    _warn_if_disconnected(channel, rounds)
+    if rounds > 1:
+        _warn_if_disconnected(channel)
     means, covs = belief
     weights = _laplacian_weights(channel.graph, gain)
     if channel.periods:
@@ -317,7 +321,8 @@ def mean_pull(
     if gain == 0:
         return np.asarray(pulled)
     _warn_if_unstable(channel.graph, gain)
-    _warn_if_disconnected(channel, rounds)
+    if rounds > 1:
+        _warn_if_disconnected(channel)
     weights = _laplacian_weights(channel.graph, gain)
     for _ in range(rounds):
         means = pulled.mean(axis=-2)
@@ -371,24 +376,25 @@ def intersect_ensembles(
     array([[0.5, 2.5],
            [0.5, 2.5]])
     """
-    _warn_if_disconnected(channel, rounds)
+    if rounds > 1:
+        _warn_if_disconnected(channel)
     unit = 1.0 if scale is None else scale
     x = ensembles / unit
     means = mean(x)
     covs = sample_covariance(x)
     # Singular if an ensemble has no more members than components.
     check_positive_definite(covs, "ensembles")
-    periods = _scale_periods(channel.periods, scale)
+    periods = channel.periods
+    if scale is not None:
+        periods = _scale_periods(periods, scale)
     fused = _intersect((means, covs), channel, rule, rounds, periods)
     # The affine map from the sample moments to the fused ones, in the given units
     # again.
     return match_moments(x, *fused) * unit
 
 
-def _scale_periods(periods: Periods, scale: Array | None) -> Periods:
+def _scale_periods(periods: Periods, scale: Array) -> Periods:
     """Return periods of components that are divided by a scale."""
-    if scale is None:
-        return periods
     pairs = zip(periods, scale.tolist(), strict=True) if periods else ()
     return tuple([None if p is None else p / s for p, s in pairs])
 
@@ -438,7 +444,9 @@ class _Received:
         """
         senders = self.means[:, self.graph.senders]
         difference = senders - self.means[:, self.graph.receivers]
-        return wrap_differences(difference, self.periods)
+        if self.periods:
+            difference = wrap_differences(difference, self.periods)
+        return difference
 
 
 def _repeat(

@@ -184,7 +184,8 @@ def pi_step(
     array([2., 2.])
     """
     channel.graph._check_undirected()
-    # A step is one of many, whatever the number of its substeps.
+    # Every step is one of many, whatever the number of its substeps: parts that stay apart in
+    # a fixed graph have an average each.
     _warn_if_disconnected(channel)
     if state.estimate.shape != inputs.shape:
         raise ValueError(

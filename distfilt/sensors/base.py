@@ -172,6 +172,11 @@ class Sensor(FrozenModel):
         """A factor of R, (m, m)."""
         return factor(self.noise_cov)
 
+    @cached_property
+    def _noise_std(self) -> Array:
+        """Standard deviation of each number's noise, (m,)."""
+        return np.asarray(np.sqrt(self.noise_cov.diagonal()))
+
     @property
     def wraps(self) -> bool:
         """Whether differences of observations wrap: by `periods` or a function of one's own."""
@@ -347,5 +352,5 @@ class Sensor(FrozenModel):
             differences,
             name="h",
             scale=std,
-            tolerance=np.sqrt(self.noise_cov.diagonal()),
+            tolerance=self._noise_std,
         )

@@ -108,7 +108,9 @@ class LikelihoodSensor(Sensor):
         sample: Callable[..., Array] | None = None,
         kind: str = "likelihood",
     ) -> None:
-        is_size = isinstance(dim, int) and dim > 0
+        # A size that is none is refused below, by name.
+        is_integer = isinstance(dim, int | np.integer) and not isinstance(dim, bool)
+        is_size = is_integer and dim > 0
         vars(self).update(
             dim=dim,
             log_likelihood=log_likelihood,

@@ -291,7 +291,10 @@ def stochastic_forecast(
     if model.has_state_noise:
         # The noise of each member depends on its state.
         return model.sample_step(ensemble, t, dt, rng=rng)
-    forecast = step_members(model, ensemble, t, dt)
+    if model.periods:
+        forecast = step_members(model, ensemble, t, dt)
+    else:
+        forecast = model.step(ensemble, t, dt)
     root = model.noise_sqrt(t, dt)
     # Without noise nothing is drawn.
     if not np.count_nonzero(root):
@@ -329,7 +332,10 @@ def exact_forecast(
             "model must have a noise that does not depend on the state for an exact forecast, got "
             f"a {type(model).__name__}: use stochastic_forecast"
         )
-    forecast = step_members(model, ensemble, t, dt)
+    if model.periods:
+        forecast = step_members(model, ensemble, t, dt)
+    else:
+        forecast = model.step(ensemble, t, dt)
     root = model.noise_sqrt(t, dt)
     # Without noise nothing is drawn.
     if not root.any():

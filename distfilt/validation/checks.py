@@ -395,7 +395,8 @@ class Bounds:
             # A single number is compared without numpy, which is faster.
             if inside is True or np.all(inside):
                 continue
-            outside = value if np.ndim(value) == 0 else value[~inside].flat[0]
+            # The number itself, not its type: 2.0, not np.float64(2.0).
+            outside = value if np.ndim(value) == 0 else value[~inside].flat[0].item()
             raise ValueError(
                 f"{name} must be {_describe_bound(side, bound)}, got {outside!r}"
             )

@@ -280,7 +280,7 @@ def test_a_run_takes_each_late_reading_when_it_arrives(family: str) -> None:
 def test_a_late_reading_belongs_to_its_own_time(
     family: str, origin: float, dt: float
 ) -> None:
-    """Whatever the clock's zero and its unit; between the times it belongs to none."""
+    """Whatever the clock's zero and its unit; between the times to one that is inserted."""
     # A random walk with unit variance a step, whatever the unit of time
     one = np.eye(1)
     walk = LinearModel.from_transition(1, lambda h: one, lambda t, h: h / dt * one)
@@ -304,9 +304,26 @@ def test_a_late_reading_belongs_to_its_own_time(
         for then in after.lagged_states:
             variances.append(f.summarize(then).variance.mean())
         assert np.argmin(variances) == k
+    between = origin + 2.4 * dt
+    after = f.step(state, now, [None], delayed=late(between))
+    variances = [f.summarize(then).variance.mean() for then in after.lagged_states]
+    assert after.times[np.argmin(variances)] == between and len(after.times) == 3
+    # A run that stepped to that time has the same, up to the sampling error of the 20 runs.
+    stepped = f.start(prior, rng=default_rng(1), runs=(20,), t=origin)
+    for t in (*times[1:3], between, times[3]):
+        stepped = f.step(stepped, t, [None])
+    expected = f.step(stepped, now, [None], delayed=late(between))
+    assert expected.times == after.times
+    for then, other in zip(after.lagged_states, expected.lagged_states, strict=True):
+        variance = f.summarize(then).variance
+        wanted = f.summarize(other).variance
+        # Gaussian filters have none.
+        sampling_error = np.sqrt((variance.var() + wanted.var()) / 20)
+        difference = abs(variance.mean() - wanted.mean())
+        assert difference < 4 * sampling_error + 1e-6 * wanted.mean()
     refused = "delayed must be of an earlier time that is kept"
     with pytest.raises(ValueError, match=refused):
-        f.step(state, now, [None], delayed=late(origin + 2.4 * dt))
+        f.step(state, now, [None], delayed=late(origin - 2.4 * dt))
 
 
 @EACH

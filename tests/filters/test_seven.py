@@ -444,11 +444,19 @@ def test_a_prior_of_any_kind() -> None:
     for g, wrong, text in (
         (f, lambda n, rng, leading: None, "got a function"),
         (f, ([0.0, 0.0], [1.0, 1.0]), r"have a covariance of .*, got \(2,\)"),
-        (unscented, flat, "definite"),
+        (unscented, (PRIOR[0], np.diag([1.0, -1.0])), "semidefinite"),
         (make_filter("mixture")[0], flat, "definite"),
     ):
         with pytest.raises(ValueError, match=f"prior must .*{text}"):
             g.start(wrong)
+    # A known constant has no variance; on a linear model sigma points and derivatives agree.
+    ends = []
+    for g in (filters.GaussianFilter(model(), EYES, NET), unscented):
+        state = g.step(g.start(flat), 0.0, [[1.0], [1.0, 2.0], [0.5]])
+        assert np.allclose(state.means[:, 1], PRIOR[0][1])
+        ends.append(g.step(state, 0.5, [[0.5], [1.0, 2.0], [0.5]]))
+    assert np.allclose(ends[0].means, ends[1].means)
+    assert np.allclose(ends[0].covariances, ends[1].covariances)
     rng = default_rng(1)
     e = filters.EnsembleFilter(model(), EYES, NET, members=4000)
     message = r"prior must have shape \(3, 4000, 2\), got \(3, 4000, 3\)"

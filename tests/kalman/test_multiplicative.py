@@ -9,8 +9,8 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from distfilt.kalman import QuaternionChart, filterpy_ekf, kalman_filter, mekf
 from distfilt.derivatives import central_difference
+from distfilt.kalman import QuaternionChart, filterpy_ekf, kalman_filter, mekf
 from distfilt.models import Model, constant_velocity, satellite_pose, simulate
 from distfilt.models.quaternions import rotate
 from distfilt.sensors import component, range_bearing, stack

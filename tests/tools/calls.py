@@ -25,7 +25,12 @@ MAX_CALLS = 4
 def describe(thing: Any) -> dict[str, Any]:
     """Return the kinds that a validated function or a frozen model declares, by argument."""
     if inspect.isclass(thing):
-        return frozen.field_constraints(thing) if issubclass(thing, FrozenModel) else {}
+        if not issubclass(thing, FrozenModel):
+            return {}
+        # A constructor of its own may take some of the fields only.
+        parameters = inspect.signature(thing).parameters
+        constraints = frozen.field_constraints(thing)
+        return {name: kind for name, kind in constraints.items() if name in parameters}
     return (
         dict(thing.signature_constraints.constraints)
         if hasattr(thing, "signature_constraints")
