@@ -10,7 +10,7 @@ from inspect import Parameter, signature
 from math import isfinite
 from typing import Any, TypeVar, cast
 
-from .annotations import FINITE_FLOAT, CallContext, Constraint
+from .annotations import FINITE_FLOAT, CallContext, ArgumentConstraint
 from .resolving import make_constraints
 
 __all__ = ["SignatureConstraints", "call_user", "skip_validation", "validated"]
@@ -28,7 +28,7 @@ class SignatureConstraints:
         self.annotations = annotations
 
     @cached_property
-    def constraints(self) -> dict[str, Constraint]:
+    def constraints(self) -> dict[str, ArgumentConstraint]:
         """Constraints by parameter, those of arrays last."""
         function = self.function
         annotations = self.annotations
