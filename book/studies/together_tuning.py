@@ -48,7 +48,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     scores = {}
     for name, cells in TRIED.items():
         p = together.problem(name)
-        data = p.data(RUNS, together.stream(seed, name))
+        data = p.simulate(RUNS, together.stream(seed, name))
         for cell in cells:
             made = together.CELLS[cell]
             for k, value in enumerate(made.grid):

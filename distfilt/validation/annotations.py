@@ -21,7 +21,7 @@ from .checks import (
     type_name,
 )
 
-__all__ = ["ALLOW_NAN", "CallContext", "Constraint", "make_constraint"]
+__all__ = ["ALLOW_NAN", "CallContext", "ArgumentConstraint", "make_constraint"]
 
 # Beside an array's shape: NaN may stand for a missing number; infinity may not.
 ALLOW_NAN = "missing allowed"
@@ -95,7 +95,7 @@ class ShapeNames:
 
 
 @dataclass(frozen=True)
-class Constraint:
+class ArgumentConstraint:
     """The values that an argument may have: a description, a conversion, and further rules."""
 
     description: str
@@ -197,7 +197,7 @@ def _convert_array(
     name: str,
     context: CallContext,
 ) -> Any:
-    """Return an array of a dtype and shape; :meth:`Constraint.validate` words a bare TypeError."""
+    """Return an array of a dtype and shape; :meth:`ArgumentConstraint.validate` words a bare TypeError."""
     if dtype is np.float64:
         array: Any = check_array(value, name, finite=not allow_nan)
         if allow_nan and np.isinf(array).any():
@@ -231,7 +231,7 @@ def _find_column(shape: tuple[int, ...], context: CallContext) -> str:
 
 
 def _convert_sequence(
-    entry: Constraint | None, value: Any, name: str, context: CallContext
+    entry: ArgumentConstraint | None, value: Any, name: str, context: CallContext
 ) -> tuple[Any, ...]:
     entries = _to_tuple(value)
     if entry is None:
@@ -240,7 +240,7 @@ def _convert_sequence(
 
 
 def _convert_tuple(
-    constraints: tuple[Constraint | None, ...],
+    constraints: tuple[ArgumentConstraint | None, ...],
     value: Any,
     name: str,
     context: CallContext,
@@ -266,7 +266,7 @@ def _to_tuple(value: Any) -> tuple[Any, ...]:
 
 
 def _convert_union(
-    alternatives: tuple[Constraint, ...],
+    alternatives: tuple[ArgumentConstraint, ...],
     optional: bool,
     value: Any,
     name: str,
@@ -283,7 +283,9 @@ def _convert_union(
     raise TypeError
 
 
-def _is_out_of_bounds(value: Any, constraint: Constraint, error: ValueError) -> bool:
+def _is_out_of_bounds(
+    value: Any, constraint: ArgumentConstraint, error: ValueError
+) -> bool:
     """Whether a number has the right type for a constraint, and breaks one of its rules.
 
     No other alternative will take it, and this error says more than a list of alternatives.
@@ -293,16 +295,16 @@ def _is_out_of_bounds(value: Any, constraint: Constraint, error: ValueError) -> 
     return is_number and takes_numbers and constraint.description not in str(error)
 
 
-FINITE_FLOAT = Constraint("a finite number", _convert_float)
+FINITE_FLOAT = ArgumentConstraint("a finite number", _convert_float)
 """The constraint of `float`."""
 
 _PLAIN_TYPES = {
     float: FINITE_FLOAT,
-    int: Constraint("an integer", _convert_int),
-    str: Constraint("a string that is not blank", _check_text),
-    bool: Constraint("a bool, True or False", _convert_bool),
-    Callable: Constraint("a function", _check_callable),
-    np.random.Generator: Constraint(
+    int: ArgumentConstraint("an integer", _convert_int),
+    str: ArgumentConstraint("a string that is not blank", _check_text),
+    bool: ArgumentConstraint("a bool, True or False", _convert_bool),
+    Callable: ArgumentConstraint("a function", _check_callable),
+    np.random.Generator: ArgumentConstraint(
         "a numpy.random.Generator (np.random.default_rng(seed))",
         partial(_check_instance, np.random.Generator),
     ),
@@ -311,7 +313,7 @@ _SEQUENCES = (Sequence, Collection, Iterable, tuple, list)
 
 
 @cache
-def make_constraint(annotation: Any) -> Constraint | None:
+def make_constraint(annotation: Any) -> ArgumentConstraint | None:
     """Return the constraint that an annotation declares, or None if any value is allowed.
 
     Examples
@@ -333,7 +335,7 @@ def make_constraint(annotation: Any) -> Constraint | None:
         return _make_union(args)
     if origin is Literal:
         options = ", ".join(map(str, args))
-        return Constraint(f"one of {options}", partial(_check_option, args))
+        return ArgumentConstraint(f"one of {options}", partial(_check_option, args))
     if origin is np.ndarray:
         return _make_array(annotation)
     if origin in _SEQUENCES:
@@ -343,10 +345,12 @@ def make_constraint(annotation: Any) -> Constraint | None:
     if cls in _PLAIN_TYPES or not isinstance(cls, type):
         return _PLAIN_TYPES.get(cls)
     article = "an" if cls.__name__[0] in "AEIOU" else "a"
-    return Constraint(f"{article} {cls.__name__}", partial(_check_instance, cls))
+    return ArgumentConstraint(
+        f"{article} {cls.__name__}", partial(_check_instance, cls)
+    )
 
 
-def _make_sequence(origin: Any, args: tuple[Any, ...]) -> Constraint:
+def _make_sequence(origin: Any, args: tuple[Any, ...]) -> ArgumentConstraint:
     """Return the constraint of a sequence of any length, or of a tuple of a fixed one."""
     # tuple[X, Y] has a fixed length, tuple[X, ...] any.
     if origin is tuple and args[-1] is not ...:
@@ -357,10 +361,10 @@ def _make_sequence(origin: Any, args: tuple[Any, ...]) -> Constraint:
         constraints = (make_constraint(args[0]),)
         description = f"a sequence, each entry {_describe(constraints, '')}"
         convert = partial(_convert_sequence, constraints[0])
-    return Constraint(description, convert, has_shape=_have_shape(constraints))
+    return ArgumentConstraint(description, convert, has_shape=_have_shape(constraints))
 
 
-def _make_union(args: tuple[Any, ...]) -> Constraint | None:
+def _make_union(args: tuple[Any, ...]) -> ArgumentConstraint | None:
     """Return the constraint of a union, whose alternatives are tried in order."""
     alternatives = []
     for arg in args:
@@ -372,14 +376,14 @@ def _make_union(args: tuple[Any, ...]) -> Constraint | None:
             return None
         alternatives.append(constraint)
     optional = type(None) in args
-    return Constraint(
+    return ArgumentConstraint(
         _describe(alternatives, " or "),
         partial(_convert_union, tuple(alternatives), optional),
         has_shape=_have_shape(alternatives),
     )
 
 
-def _make_annotated(base: Any, metadata: tuple[Any, ...]) -> Constraint | None:
+def _make_annotated(base: Any, metadata: tuple[Any, ...]) -> ArgumentConstraint | None:
     """Return the constraint of a type with a shape and rules beside it.
 
     Of several shapes the last one counts, so that an alias with a shape can be narrowed.
@@ -388,7 +392,9 @@ def _make_annotated(base: Any, metadata: tuple[Any, ...]) -> Constraint | None:
     shapes = [note for note in metadata if isinstance(note, str) and note != ALLOW_NAN]
     if get_origin(base) is np.ndarray:
         shape = shapes[-1].split() if shapes else None
-        constraint: Constraint | None = _make_array(base, shape, ALLOW_NAN in metadata)
+        constraint: ArgumentConstraint | None = _make_array(
+            base, shape, ALLOW_NAN in metadata
+        )
     else:
         constraint = make_constraint(base)
     if constraint is None:
@@ -400,7 +406,7 @@ def _make_annotated(base: Any, metadata: tuple[Any, ...]) -> Constraint | None:
 
 def _make_array(
     base: Any, words: Sequence[str] | None = None, allow_nan: bool = False
-) -> Constraint:
+) -> ArgumentConstraint:
     """Return the constraint of an array, of any shape if there are no words for it."""
     # NDArray[X] is ndarray[shape, dtype[X]].
     dtype = get_args(get_args(base)[1])[0]
@@ -411,7 +417,7 @@ def _make_array(
         description += f" of shape ({', '.join(words)})"
         shape = ShapeNames.parse(words)
     convert = partial(_convert_array, dtype, shape, allow_nan)
-    return Constraint(description, convert, has_shape=True)
+    return ArgumentConstraint(description, convert, has_shape=True)
 
 
 def _resolve_alias(annotation: Any) -> Any:
@@ -423,11 +429,11 @@ def _resolve_alias(annotation: Any) -> Any:
     return _resolve_alias(value[args] if args else value)
 
 
-def _describe(constraints: Iterable[Constraint | None], separator: str) -> str:
+def _describe(constraints: Iterable[ArgumentConstraint | None], separator: str) -> str:
     """Join the descriptions of several constraints."""
     texts = [c.description if c else "anything" for c in constraints]
     return separator.join(texts)
 
 
-def _have_shape(constraints: Iterable[Constraint | None]) -> bool:
+def _have_shape(constraints: Iterable[ArgumentConstraint | None]) -> bool:
     return any(c is not None and c.has_shape for c in constraints)

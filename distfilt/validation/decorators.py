@@ -10,7 +10,7 @@ from inspect import Parameter, signature
 from math import isfinite
 from typing import Any, TypeVar, cast
 
-from .annotations import FINITE_FLOAT, CallContext, Constraint
+from .annotations import FINITE_FLOAT, CallContext, ArgumentConstraint
 from .checks import InvalidArgumentError
 from .resolving import make_constraints
 
@@ -35,7 +35,7 @@ class SignatureConstraints:
         self.annotations = annotations
 
     @cached_property
-    def constraints(self) -> dict[str, Constraint]:
+    def constraints(self) -> dict[str, ArgumentConstraint]:
         """Constraints by parameter, those of arrays last."""
         function = self.function
         annotations = self.annotations

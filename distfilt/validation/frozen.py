@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from .annotations import CallContext, Constraint
+from .annotations import CallContext, ArgumentConstraint
 from .resolving import make_constraints, sort_arrays_last
 
 __all__ = ["FrozenModel", "field_constraints"]
@@ -89,10 +89,10 @@ def _fields(
 
 
 @cache
-def field_constraints(cls: Any) -> dict[str, Constraint]:
+def field_constraints(cls: Any) -> dict[str, ArgumentConstraint]:
     """Return the constraints of a dataclass's fields, inherited ones included, arrays last."""
     names, _ = _fields(cls)
-    constraints: dict[str, Constraint] = {}
+    constraints: dict[str, ArgumentConstraint] = {}
     # Base classes first, so that a subclass may narrow the annotation of a field.
     for base in reversed(cls.__mro__):
         annotations = get_annotations(base)

@@ -9,14 +9,14 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from .annotations import Constraint, make_constraint
+from .annotations import ArgumentConstraint, make_constraint
 
 __all__ = ["make_constraints"]
 
 
 def make_constraints(
     annotations: Mapping[str, Any], module: str, names: Mapping[str, Any], owner: str
-) -> dict[str, Constraint]:
+) -> dict[str, ArgumentConstraint]:
     """Return the constraints that annotations declare, those of arrays last.
 
     Arrays come last because their shapes may refer to other arguments.
@@ -38,7 +38,7 @@ def make_constraints(
         If an annotation uses a name that neither the module nor its imports under
         ``TYPE_CHECKING`` define.
     """
-    constraints: dict[str, Constraint] = {}
+    constraints: dict[str, ArgumentConstraint] = {}
     for argument, annotation in annotations.items():
         if argument == "return":
             continue
@@ -51,7 +51,9 @@ def make_constraints(
     return sort_arrays_last(constraints)
 
 
-def sort_arrays_last(constraints: dict[str, Constraint]) -> dict[str, Constraint]:
+def sort_arrays_last(
+    constraints: dict[str, ArgumentConstraint],
+) -> dict[str, ArgumentConstraint]:
     """Return constraints in their order, but with arrays behind all others."""
     items = sorted(constraints.items(), key=lambda item: item[1].has_shape)
     return dict(items)
