@@ -6,14 +6,14 @@ it, the values that are allowed, and the value that came. Nothing is repaired. N
 checked again; :func:`skip_validation` does the same for a loop of your own.
 
 ========================================  ==========================================================
-Annotation                              Allowed values, and the function's value
+Annotation                                Allowed values, and the function's value
 ========================================  ==========================================================
 ``Annotated[ArrayInput, "... N d"]``      finite real numbers of this shape, as a float64 array
 ``Annotated[ArrayInput, …, ALLOW_NAN]``   the same, where NaN stands for a missing number
 ``Annotated[ArrayInput, "d d", rule]``    the same, if ``rule(value, name)`` raises no error
 ``Annotated[MaskInput, "A"]``             booleans; ``IndicesInput`` for integers
 ``float``, ``int``, ``bool``, ``str``     a finite number, an integer, a flag, a string not blank
-``PositiveFloat``, ``UnitInterval`` …     numbers in bounds; others by ``Annotated[float, Bounds(…)]``
+``PositiveFloat``, ``UnitInterval`` …     numbers in bounds; or ``Annotated[float, Bounds(…)]``
 ``Literal["a", "b"]``                     one of these words
 ``Rng``                                   a ``numpy.random.Generator``
 ``Callable[..., Any]``                    a function
