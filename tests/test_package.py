@@ -175,7 +175,7 @@ def test_dir_lists_subpackages_and_their_public_names() -> None:
 def run(code: str, path: Path | None = None) -> str:
     """Run code in a fresh interpreter, outside the repository; return its standard output."""
     result = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code],
+        [sys.executable, "-P", "-W", "error", "-c", code],
         cwd=path or ROOT.parent,
         env={**os.environ, "PYTHONPATH": str(path or "")},
         capture_output=True,
