@@ -34,8 +34,8 @@ Information = tuple[Array, Array]
 class FloodingMixin:
     """Flood the observations of a time before any agent filters.
 
-    An observation crosses a link at most once in each direction, with the number of the
-    agent that made it, until all agents have all observations.
+    An observation crosses a link at most once in each direction, with the
+    number of the agent that made it, until all agents have all observations.
     """
 
     def next_state(self, step: Any) -> Any:
@@ -130,7 +130,7 @@ class MeasurementConsensus(GaussianFilter):
     share_observations: bool = False
 
     def next_state(self, step: Any) -> Any:
-        """Forecast, linearize the own observations, average, add the information."""
+        """Forecast, linearize, average the information, add it."""
         t = step.state.t
         d = self.model.dim
         F = self.model.jacobian(step.state.means, t, step.dt)

@@ -5,23 +5,23 @@ below is checked and converted before the function runs. A wrong argument raises
 it, the values that are allowed, and the value that came. Nothing is repaired. Nested calls are not
 checked again; :func:`skip_validation` does the same for a loop of your own.
 
-======================================  ==========================================================
-Annotation                              Allowed values, and the function's value
-======================================  ==========================================================
-``Annotated[ArrayInput, "... N d"]``    finite real numbers of this shape, as a float64 array
-``Annotated[ArrayInput, …, ALLOW_NAN]``  the same, where NaN stands for a missing number
-``Annotated[ArrayInput, "d d", rule]``  the same, if ``rule(value, name)`` raises no error
-``Annotated[MaskInput, "A"]``           booleans; ``IndicesInput`` for integers
-``float``, ``int``, ``bool``, ``str``   a finite number, an integer, a flag, a string not blank
-``PositiveFloat``, ``UnitInterval`` …   numbers in bounds; others by ``Annotated[float, Bounds(…)]``
-``Literal["a", "b"]``                   one of these words
-``Rng``                                 a ``numpy.random.Generator``
-``Callable[..., Any]``                  a function
-``Graph``, any other class              an instance
-``Sequence[X]``, ``tuple[X, ...]``      any sequence of such values, as a tuple
-``X | Y``, ``X | None``                 a value that fits one of them
-``Any``, ``ArrayLike``                  any value, unchanged
-======================================  ==========================================================
+========================================  ==========================================================
+Annotation                                Allowed values, and the function's value
+========================================  ==========================================================
+``Annotated[ArrayInput, "... N d"]``      finite real numbers of this shape, as a float64 array
+``Annotated[ArrayInput, …, ALLOW_NAN]``   the same, where NaN stands for a missing number
+``Annotated[ArrayInput, "d d", rule]``    the same, if ``rule(value, name)`` raises no error
+``Annotated[MaskInput, "A"]``             booleans; ``IndicesInput`` for integers
+``float``, ``int``, ``bool``, ``str``     a finite number, an integer, a flag, a string not blank
+``PositiveFloat``, ``UnitInterval`` …     numbers in bounds; or ``Annotated[float, Bounds(…)]``
+``Literal["a", "b"]``                     one of these words
+``Rng``                                   a ``numpy.random.Generator``
+``Callable[..., Any]``                    a function
+``Graph``, any other class                an instance
+``Sequence[X]``, ``tuple[X, ...]``        any sequence of such values, as a tuple
+``X | Y``, ``X | None``                   a value that fits one of them
+``Any``, ``ArrayLike``                    any value, unchanged
+========================================  ==========================================================
 
 In a shape each word names the size of an axis. A number is exact, and so is the name of an argument
 that is an integer, or a path such as ``model.dim`` or ``self.dim``; ``*channel.runs`` stands for

@@ -197,7 +197,10 @@ def _convert_array(
     name: str,
     context: CallContext,
 ) -> Any:
-    """Return an array of a dtype and shape; :meth:`ArgumentConstraint.validate` words a bare TypeError."""
+    """Return an array of a dtype and shape.
+
+    :meth:`ArgumentConstraint.validate` gives a bare TypeError its message.
+    """
     if dtype is np.float64:
         array: Any = check_array(value, name, finite=not allow_nan)
         if allow_nan and np.isinf(array).any():

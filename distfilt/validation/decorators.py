@@ -10,8 +10,7 @@ from inspect import Parameter, signature
 from math import isfinite
 from typing import Any, TypeVar, cast
 
-from .annotations import FINITE_FLOAT, CallContext, ArgumentConstraint
-from .checks import InvalidArgumentError
+from .annotations import FINITE_FLOAT, ArgumentConstraint, CallContext
 from .resolving import make_constraints
 
 __all__ = [

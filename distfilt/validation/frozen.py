@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from .annotations import CallContext, ArgumentConstraint
+from .annotations import ArgumentConstraint, CallContext
 from .resolving import make_constraints, sort_arrays_last
 
 __all__ = ["FrozenModel", "field_constraints"]

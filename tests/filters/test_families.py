@@ -13,9 +13,9 @@ from numpy.random import default_rng
 
 from distfilt import filters
 from distfilt.kalman import rts_smoother
-from distfilt.models import Model
+from distfilt.models import Model, constant_velocity
 from distfilt.network import Faults, covariance_intersection, graphs, mean_pull
-from distfilt.sensors import Sensor, component, from_name
+from distfilt.sensors import Sensor, component, from_name, stack
 from distfilt.updates import enkf_exact, enkf_sampled_covariance
 
 from .families import (
@@ -480,3 +480,30 @@ def test_nees_of_a_collapsed_cloud_is_infinite() -> None:
     error = entry["mean"].values - truth[0, 1]
     nees = error @ np.linalg.solve(entry["covariance"].values, error)
     assert abs(recorded[0, 1] - nees) < 1e-9
+
+
+class EverythingKnown(filters.GaussianFilter):
+    """Gaussian filters whose agents get the observations of all of them."""
+
+    def next_state(self, step: Any) -> Any:
+        """Hand every observation to every agent, then go on as the family does."""
+        everything = [entry for entries in step.observations for entry in entries]
+        step.observations = [everything for _ in step.observations]
+        return super().next_state(step)
+
+
+def test_an_observation_is_read_by_the_sensor_of_its_own_agent() -> None:
+    # The agents' sensors differ in component and accuracy: the wrong one gives another mean.
+    walk = constant_velocity(sigma=0.3, axes=1)
+    sensors = [component([0], std=0.5), component([1], std=2.0)]
+    prior = (np.zeros(2), np.diag([4.0, 1.0]))
+    agents = EverythingKnown(walk, sensors, share_observations=False)
+    state = agents.step(agents.start(prior), 1.0, [[1.2], [-0.4]])
+    # One agent with both sensors is the filter that each of them should be.
+    central = filters.GaussianFilter(walk, [stack(sensors)])
+    expected = central.step(central.start(prior), 1.0, [[1.2, -0.4]])
+    for agent in range(2):
+        assert np.allclose(state.means[agent], expected.means[0], atol=1e-12)
+        assert np.allclose(
+            state.covariances[agent], expected.covariances[0], atol=1e-12
+        )
