@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from .validation import Array, Mask, call_user
-from .validation.first_use import is_first_use
+from .validation.first_use import is_first_use, needs_check
 
 __all__: list[str] = []
 
@@ -395,7 +395,7 @@ def evaluate_derivative(
                     4,
                 )
         return slope
-    copies = [np.copy(x) if np.ndim(x) else x for x in args]
+    copies = [x.copy() if isinstance(x, np.ndarray) else x for x in args]
     slope = np.asarray(call_user(owner.derivative, *copies))
     if slope.shape not in (shape, shape[-2:]):
         raise ValueError(f"derivative must return shape {shape}, got {slope.shape}")
@@ -405,7 +405,14 @@ def evaluate_derivative(
             RuntimeWarning,
             4,
         )
-    return np.broadcast_to(slope, shape)
+    return slope if slope.shape == shape else np.broadcast_to(slope, shape)
+
+
+def needs_differences(owner: Any) -> bool:
+    """Whether differences are taken for an owner's derivative: in its place, or to check it."""
+    if owner.derivative is None:
+        return True
+    return bool(owner.is_validated and needs_check(owner, "derivative"))
 
 
 def _is_uncertain(slope: Array, error: Array, scale: Array, tolerance: Array) -> bool:

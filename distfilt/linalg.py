@@ -46,6 +46,14 @@ def equal_weights(members: int) -> Array:
     return np.full((1, members), 1 / members)
 
 
+@lru_cache(maxsize=16)
+def identity(dim: int) -> Array:
+    """Return the identity matrix, made once for each size and read-only."""
+    matrix = np.eye(dim)
+    matrix.setflags(write=False)
+    return matrix
+
+
 def symmetrise(m: Array) -> Array:
     """Average a square matrix and its transpose, where a product loses symmetry by rounding."""
     return np.asarray(0.5 * (m + m.swapaxes(-1, -2)))

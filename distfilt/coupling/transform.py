@@ -53,8 +53,9 @@ Forecast = Annotated[ArrayInput, "*transformed.shape", SQUARED]
 _TIE_BREAK = 1e-7
 """Largest addition to a cost, in units of its range. The weighted mean stays exact, the plan costs
 at most this more."""
-_FAR = 1e-3
-"""Members are far from each other if a quarter of the costs is below this part of the range."""
+_FAR = 1e-6
+"""Members are far from each other if a quarter of the costs is below this part of the range. Above
+it what the addition may cost is at most a tenth of the lower quartile of the costs."""
 _NO_MASS = 1e-15
 """Weights below this are spread evenly where there are far members."""
 

@@ -7,7 +7,7 @@ A width is a number, or has a row for each agent and a column for each axis: (N,
 from __future__ import annotations
 
 import warnings
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -300,7 +300,7 @@ def bandwidth(
     *,
     rule: Literal["silverman", "least_squares"] = "silverman",
     each_axis: bool | None = None,
-) -> Any:
+) -> float | Array:
     r"""Choose a bandwidth from the agents' positions.
 
     Parameters
@@ -343,8 +343,8 @@ def bandwidth(
     if each_axis is None:
         each_axis = bool(np.ptp(grid.width) > 1e-9 * grid.width.max())
     # No bandwidth may be below half a cell.
-    least: Any = 0.5 * float(grid.spacing.max())
-    scale: Any = spread
+    least: float | Array = 0.5 * float(grid.spacing.max())
+    scale: float | Array = spread
     if each_axis:
         least = 0.5 * grid.spacing[None]
         scale = positions.std(axis=0)[None]
@@ -358,9 +358,10 @@ def bandwidth(
     # From far below Silverman's bandwidth, for clusters, to above it.
     factors = np.geomspace(0.15, 1.5, 20)
     least = np.maximum(least, floor)
-    candidates = [np.maximum(silverman * factor, least) for factor in factors]
-    if not each_axis:
-        candidates = [float(h) for h in candidates]
+    candidates: list[float | Array] = []
+    for factor in factors:
+        width = np.maximum(silverman * factor, least)
+        candidates.append(width if each_axis else float(width))
     spread_out = _undo_rounding(positions, grid, step)
     places = _number_places(spread_out, grid)
     scores = [_cross_validation_score(spread_out, grid, h, places) for h in candidates]

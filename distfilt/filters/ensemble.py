@@ -426,7 +426,7 @@ class EnsembleFilter(
             new = call_user(
                 self.update, x, h, y, noise, rng=rng, predict=predict, **options
             )
-            return cast(Array, new)
+            return new
         if self._stacks:
             new = with_missing(self.update, x, h, y, noise, rng=rng)
             _check_shape(new, "update", x.shape)

@@ -11,11 +11,13 @@ from typing import Annotated, Any, ClassVar, Literal, Self, cast
 
 import numpy as np
 
+from ..derivatives import needs_differences
 from ..gaussians.single import condition, unscented_points
 from ..linalg import (
     EPS,
     cholesky,
     deviations,
+    identity,
     factor,
     solve_semidefinite,
     solve_upper,
@@ -212,7 +214,7 @@ class GaussianFilter(
         """
         means, covs = self._forecast(step)
         # Failed runs get a harmless Gaussian, so that the batch can go on.
-        unit = np.eye(means.shape[-1])
+        unit = identity(means.shape[-1])
         means = step.check_forecast(means, 0.0)
         covs = step.check_forecast(covs, unit)
         for place, group in step.received():
@@ -252,7 +254,7 @@ class GaussianFilter(
             move = partial(model.step, t=state.t, dt=dt)
         mean, slope, extra = self._linearize(
             move,
-            partial(model.jacobian, t=state.t, dt=dt),
+            partial(self._differentiate_step, step),
             state.means,
             state.covariances,
             isinstance(model, LinearModel),
@@ -261,9 +263,11 @@ class GaussianFilter(
         slope = np.ascontiguousarray(slope)
         old = state.joint_covariances
         if model.has_state_noise:
-            noise = model.noise_at(state.means, state.t, dt) + extra
+            noise = model.noise_at(state.means, state.t, dt)
         else:
-            noise = model.Q(state.t, dt) + extra
+            noise = model.Q(state.t, dt)
+        if extra is not None:
+            noise = noise + extra
         cov = slope @ old[..., :d, :d] @ slope.mT + noise
         size = len(step.times) * d
         if size:
@@ -277,6 +281,17 @@ class GaussianFilter(
             cov[..., :, :d] *= self.inflation
         return mean, cov
 
+    def _differentiate_step(
+        self, step: Step[GaussianState], means: Array, covs: Array
+    ) -> Array:
+        """Return the derivative of the model's step at means (..., d)."""
+        model = self.model
+        std = None
+        if not isinstance(model, LinearModel) and needs_differences(model):
+            # Differences are scaled by the state's standard deviations.
+            std = deviations(covs)
+        return model.jacobian(means, step.state.t, step.dt, std=std)
+
     def _step_points(self, step: Step[GaussianState], points: Array) -> Array:
         """Move points (..., N, d) without noise, on one branch."""
         t = step.state.t
@@ -288,18 +303,19 @@ class GaussianFilter(
     def _linearize(
         self,
         function: Callable[[Array], Array],
-        jacobian: Callable[..., Array],
+        jacobian: Callable[[Array, Array], Array],
         mean: Array,
         cov: Array,
         is_linear: bool,
-    ) -> tuple[Array, Array, Array | float]:
-        """Return value, slope and extra covariance of a function of a Gaussian (..., d)."""
+    ) -> tuple[Array, Array, Array | None]:
+        """Return value, slope and extra covariance, if any, of a function of a Gaussian.
+
+        ``jacobian(mean, cov)`` is the derivative at the mean (..., d).
+        """
         if is_linear or self.linearization == "extended":
             # For a linear function unscented points would give the same.
             value = function(mean[..., None, :])[..., 0, :]
-            # Differences are scaled by the state's standard deviations.
-            slope = jacobian(mean) if is_linear else jacobian(mean, std=deviations(cov))
-            return value, slope, 0.0
+            return value, jacobian(mean, cov), None
         root = _factor_covariance(cov)
         d = mean.shape[-1]
         points, weights = unscented_points(mean, root, kappa=self.kappa)
@@ -345,19 +361,18 @@ class GaussianFilter(
         )
         if not linear:
             # Mostly everything is seen, and each number depends on the state: 0 < Σ |H| < ∞.
-            steepness = np.abs(slope).sum(axis=-1)
-            is_seen = (steepness > 0) & (steepness < np.inf) & ~np.isnan(predicted)
+            # NaN, where the prediction is, is not above zero.
+            steepness = np.abs(slope).sum(axis=-1) + 0.0 * predicted
+            is_seen = (steepness > 0) & (steepness < np.inf)
             if np.count_nonzero(is_seen) < is_seen.size:
                 predicted = self._leave_out_unseen(predicted, slope, group, step)
-        predicted_cov = slope @ cov @ slope.mT + extra
 
         def moments(_: Array) -> tuple[Array, Array]:
             """Return the moments of the prediction, which lie on one branch."""
-            return predicted, predicted_cov
+            predicted_cov = slope @ cov @ slope.mT
+            return predicted, predicted_cov if extra is None else predicted_cov + extra
 
         group = step.gate(group, moments, predicted[..., None, :])
-        # S = H P Hᵀ + R, where the extra covariance of the unscented points counts as noise.
-        noise = np.full((*slope.shape[:-1], slope.shape[-2]), group.noise) + extra
         if joint_mean.shape[-1] > d:
             # Zero slope in the other times' states.
             joint_slope = np.zeros((*slope.shape[:-1], joint_mean.shape[-1]))
@@ -365,11 +380,16 @@ class GaussianFilter(
             slope = joint_slope
         # r = y* - h(m); NaN where a component is missing, which `condition` leaves out.
         innovation = group.target - predicted
+        arrays = (joint_mean, joint_cov, innovation, slope)
+        if extra is not None:
+            # S = H P Hᵀ + R, where the extra covariance of the unscented points counts as noise.
+            arrays = (*arrays, group.noise + extra)
         means[..., rows, :], covs[..., rows, :, :] = step.apply(
             _condition_rows,
-            (joint_mean, joint_cov, innovation, slope, noise),
+            arrays,
             (joint_mean, joint_cov),
             group.agents,
+            shared=group.noise,
         )
 
     def _leave_out_unseen(

@@ -18,7 +18,7 @@ __all__ = ["load_fields", "save_state"]
 
 T = TypeVar("T")
 
-_FORMAT = 6
+_FORMAT = 7
 """Raised when the names or the meaning of saved fields change."""
 
 _DIGEST_SIZE = 32

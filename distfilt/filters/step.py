@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, ca
 
 import numpy as np
 
-from ..linalg import cholesky, log_det, quadratic_form
+from ..derivatives import needs_differences
+from ..linalg import cholesky, deviations, log_det, quadratic_form
 from ..models import Model
 from ..periods import check_sensor, gather
 from ..sensors import LikelihoodSensor, Sensor
 from ..validation import Array, Mask, call_user, format_number
+from ..validation.batching import name_of_check
 from ..validation.first_use import needs_check
 from . import failures
 from .changes import Previous, References
@@ -169,7 +171,7 @@ class Step(Generic[S]):
 
     def check_forecast(self, values: Array, old: Array | float) -> Array:
         """Return a finite forecast (*runs, A, ...), and `old` in failed runs."""
-        if not np.isfinite(values).all():
+        if np.count_nonzero(np.isfinite(values)) < values.size:
             # One row for each run and agent.
             lead = len(self.runs) + 1
             errors = failures.find_nonfinite_rows(values, lead, "forecast")
@@ -396,7 +398,7 @@ class Step(Generic[S]):
             )
         # A row may also fail without an error, by overflow for instance.
         for values in results:
-            if not np.isfinite(values).all():
+            if np.count_nonzero(np.isfinite(values)) < values.size:
                 errors |= failures.find_nonfinite_rows(values, lead, "result")
         if errors:
             # Failed rows keep their values from before the computation.
@@ -630,8 +632,11 @@ class Received:
         ]
         # The model, if it has circular components.
         self.circular_model: Model | None = None
+        # All agents have the same only sensor: nothing has to be sorted.
+        self.has_one_part = isinstance(self.parts[0].agents, slice)
         self._matrices: dict[int, Array] = {}
-        self._checked: set[Sensor] = set()
+        # Sensors whose function has been checked, for a single state or for several.
+        self._checked: set[tuple[Sensor, bool]] = set()
 
     def _make_part(self, sensor: Sensor, starts: list[tuple[int, int]]) -> _Part:
         places, first = np.array(starts, dtype=np.intp).T
@@ -781,19 +786,22 @@ class Received:
             )
             # A linear prediction runs on, so that no cut divides it.
             return self._place(result, branch) if self.wraps else result
-        n_states = states.shape[-2]
-        # Numbers before states, so that the cells of a sensor are one index.
-        result = np.empty((*states.shape[:-2], self.target.shape[-1], n_states))
-        for part in self.parts:
-            # Only sensors that measure a change need the previous states.
-            before = None if previous is None else previous[..., part.agents, :, :]
-            of_agents = states[..., part.agents, :, :]
-            values = self._predict_part(part, of_agents, before)
-            if self.wraps and part.sensor.wraps and branch != "each":
-                values = _gather_predictions(part.sensor, values, of_agents, before)
-            result[(..., *part.cells, slice(None))] = values.swapaxes(-1, -2)
-        result = np.ascontiguousarray(result.swapaxes(-1, -2))
-        if np.isinf(result).any():
+        if self.has_one_part:
+            values = self._predict_part(self.parts[0], states, previous, branch)
+            # A copy, since the user's function may keep its result.
+            result = np.array(values, order="C")
+        else:
+            # Numbers before states, so that the cells of a sensor are one index.
+            n_states = states.shape[-2]
+            rows = np.empty((*states.shape[:-2], self.target.shape[-1], n_states))
+            for part in self.parts:
+                # Only sensors that measure a change need the previous states.
+                before = None if previous is None else previous[..., part.agents, :, :]
+                of_agents = states[..., part.agents, :, :]
+                values = self._predict_part(part, of_agents, before, branch)
+                rows[(..., *part.cells, slice(None))] = values.swapaxes(-1, -2)
+            result = np.ascontiguousarray(rows.swapaxes(-1, -2))
+        if np.count_nonzero(np.isinf(result)):
             raise ValueError(
                 "predicted must have finite numbers or NaN (missing), got infinity"
             )
@@ -839,21 +847,27 @@ class Received:
             check_sensor(part.sensor, model, states[rows], before)
 
     def _predict_part(
-        self, part: _Part, states: Array, previous: Array | None
+        self, part: _Part, states: Array, previous: Array | None, branch: str
     ) -> Array:
         """Predict with one sensor; its function is called directly once it has been checked."""
         sensor = part.sensor
+        shape = (*states.shape[:-1], sensor.dim)
         if isinstance(sensor, LikelihoodSensor):
             # Nothing is compared with it: see `log_likelihood`.
-            return np.zeros((*states.shape[:-1], sensor.dim))
-        if sensor in self._checked:
+            return np.zeros(shape)
+        is_single = states.size == states.shape[-1]
+        if (sensor, is_single) in self._checked:
             # A copy, since the user's function may work in place.
             values = np.asarray(call_user(sensor.h, states.copy()), dtype=np.float64)
-            if values.shape == (*states.shape[:-1], sensor.dim):
-                return values
-        values = sensor.predict(states, previous)
-        if not sensor.uses_previous and not needs_check(sensor, "h"):
-            self._checked.add(sensor)
+            if values.shape != shape:
+                values = sensor.predict(states, previous)
+        else:
+            values = sensor.predict(states, previous)
+            check = name_of_check("h", states)
+            if not sensor.uses_previous and not needs_check(sensor, check):
+                self._checked.add((sensor, is_single))
+        if sensor.wraps and branch != "each":
+            return _gather_predictions(sensor, values, states, previous)
         return values
 
     def wrap_near(self, predicted: Array, reference: Array) -> Array:
@@ -873,14 +887,19 @@ class Received:
             values[index] = part.sensor.bring_near(ours, aim).swapaxes(-1, -2)
         return predicted
 
-    def jacobian(self, states: Array, std: Array | None = None) -> Array:
+    def jacobian(self, states: Array, cov: Array) -> Array:
         """Return the derivatives of the observations at states (*runs, G, d), (*runs, G, M, d).
 
-        `std` holds the standard deviations of the states' components, (*runs, G, d).
+        The states have the covariances `cov`, (*runs, G, d, d), which scale differences.
         """
         d = states.shape[-1]
         if self.linear:
             return np.full((*self.target.shape, d), self.H(d))
+        std = None
+        if any([needs_differences(part.sensor) for part in self.parts]):
+            std = deviations(cov)
+        if self.has_one_part:
+            return self.parts[0].sensor.jacobian(states, std=std)
         result = np.empty((*self.target.shape, d))
         for part in self.parts:
             # H of the sensor's agents, (*runs, agents, m, d)

@@ -11,6 +11,7 @@ from ..linalg import (
     EPS,
     broadcast_leading,
     cholesky,
+    identity,
     log_det,
     quadratic_form,
     solve_definite,
@@ -208,7 +209,7 @@ def innovation_moments(
 def joseph(cov: Array, gain: Array, H: Array, R: Array) -> Array:
     """The covariance after an update with any gain, as a sum of squares: Joseph's form."""
     # P⁺ = (I - K H) P (I - K H)ᵀ + K R Kᵀ
-    reduction = np.eye(cov.shape[-1]) - gain @ H
+    reduction = identity(cov.shape[-1]) - gain @ H
     prior_part = reduction @ cov @ np.ascontiguousarray(reduction.mT)
     posterior = prior_part + gain @ R @ gain.mT
     return np.asarray(0.5 * (posterior + posterior.mT))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -94,7 +94,7 @@ class GaussianMixture(FrozenModel):
         return cls(np.ones(1), mean[None], cov[None])
 
     @classmethod
-    def construct(cls, *args: Any, **options: Any) -> Self:
+    def construct(cls, *args: object, **options: object) -> Self:
         """Build a mixture of arrays that the library made, unchecked, and freeze them."""
         mixture = super().construct(*args, **options)
         # Factors and densities are cached, so the arrays must not change.

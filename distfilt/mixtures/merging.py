@@ -7,21 +7,34 @@ loop runs on numpy, with the costs of a row of pairs in one vectorised call.
 from __future__ import annotations
 
 import importlib
-from typing import Any
+import importlib.util
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 
+from ..validation import Array, Indices, Mask
 from .reduction import pair_costs
 
-try:
-    njit: Any = importlib.import_module("numba").njit
-except ModuleNotFoundError:
-    njit = None
+F = TypeVar("F", bound=Callable[..., object])
 
 __all__ = ["merge_pairs"]
 
 
-def loop_costs(w: Any, m: Any, p: Any, log_dets: Any, i: Any, others: Any) -> Any:
+def has_numba() -> bool:
+    """Whether numba is installed."""
+    return importlib.util.find_spec("numba") is not None
+
+
+def compile_function(function: F) -> F:
+    """Compile a function by numba, which stores the compiled code between processes."""
+    compiled: F = importlib.import_module("numba").njit(cache=True)(function)
+    return compiled
+
+
+def loop_costs(
+    w: Array, m: Array, p: Array, log_dets: Array, i: int, others: Indices
+) -> Array:
     """As :func:`pair_costs`, for numba: form and factor each merged covariance in one pass."""
     d = m.shape[1]
     lower = np.empty((d, d))
@@ -54,7 +67,7 @@ def loop_costs(w: Any, m: Any, p: Any, log_dets: Any, i: Any, others: Any) -> An
     return costs
 
 
-def merge_pairs(w: Any, m: Any, p: Any, n_components: Any) -> Any:
+def merge_pairs(w: Array, m: Array, p: Array, n_components: int) -> Mask:
     """Merge the cheapest pair, in place, until `n_components` are left; mark those that are.
 
     Parameters
@@ -85,8 +98,8 @@ def merge_pairs(w: Any, m: Any, p: Any, n_components: Any) -> Any:
             best[k] = table[k, nearest[k]]
         # The first of the pairs that cost the same, so that rounding does not choose.
         limit = best.min() + 1e-12 + 1e-9 * abs(best.min())
-        i = np.argmax(best <= limit)
-        j = np.argmax(table[i] <= limit)
+        i = int(np.argmax(best <= limit))
+        j = int(np.argmax(table[i] <= limit))
         # Component i becomes the merger of i and j with the moments of both.
         total = w[i] + w[j]
         a = w[i] / total if total > 0 else 0.5
@@ -116,9 +129,9 @@ def merge_pairs(w: Any, m: Any, p: Any, n_components: Any) -> Any:
     return remaining
 
 
-if njit is None:
-    row_costs = pair_costs
-else:
-    # numba stores compiled code between processes, and calls only compiled functions.
-    row_costs = njit(cache=True)(loop_costs)
-    merge_pairs = njit(cache=True)(merge_pairs)
+row_costs: Callable[[Array, Array, Array, Array, int, Indices], Array] = pair_costs
+
+if has_numba():
+    # Compiled code calls only compiled functions.
+    row_costs = compile_function(loop_costs)
+    merge_pairs = compile_function(merge_pairs)

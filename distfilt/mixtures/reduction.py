@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -184,8 +184,9 @@ def merge_costs(mixture: GaussianMixture) -> Array:
     """
     weights, means, covs, _ = _whiten(mixture)
     log_dets = np.linalg.slogdet(covs)[1]
-    index = np.arange(mixture.n_components)
-    rows = [pair_costs(weights, means, covs, log_dets, i, index) for i in index]
+    n = mixture.n_components
+    index = np.arange(n)
+    rows = [pair_costs(weights, means, covs, log_dets, i, index) for i in range(n)]
     return np.stack(rows)
 
 
@@ -356,7 +357,7 @@ def _whiten(mixture: GaussianMixture) -> tuple[Array, Array, Array, Array]:
 
 
 def pair_costs(
-    weights: Array, means: Array, covs: Array, log_dets: Array, i: Any, others: Indices
+    weights: Array, means: Array, covs: Array, log_dets: Array, i: int, others: Indices
 ) -> Array:
     """Runnalls' bound of component i with others; a pair without weight costs nothing."""
     total = weights[i] + weights[others]

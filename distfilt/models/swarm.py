@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,7 +51,7 @@ def check_inside(positions: Array, low: Array, high: Array) -> None:
         )
 
 
-def _expand_diffusion(value: ArrayLike, points: tuple[int, ...], dim: int) -> Array:
+def _expand_diffusion(value: object, points: tuple[int, ...], dim: int) -> Array:
     """Validate a diffusion, isotropic or per axis, and broadcast it to (*points, d)."""
     diffusion = check_array(value, "diffusion")
     # Isotropic: one number, or one at each point.
@@ -101,7 +101,8 @@ class Swarm(FrozenModel):
     """
 
     drift: Callable[[Array, float], Array]
-    diffusion: Any  # a number, one for each axis, or a function: checked below
+    # A number, one for each axis, or a function: checked below.
+    diffusion: object
     low: Annotated[Array, "d"] = field(
         default_factory=partial(np.zeros, 2), kw_only=True
     )

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from numbers import Integral
-from typing import Any
+from typing import Protocol, TypeGuard
 
 import numpy as np
 import scipy
@@ -14,7 +14,7 @@ from ..validation import Indices, check_array
 __all__: list[str] = []
 
 
-def from_matrix(value: Any, name: str, *, directed: bool) -> scipy.sparse.csr_array:
+def from_matrix(value: object, name: str, *, directed: bool) -> scipy.sparse.csr_array:
     """Return the links that a matrix of zeros and ones marks, an array or sparse."""
     if not scipy.sparse.issparse(value):
         # Booleans are no numbers to `check_array`, but here they are zeros and ones.
@@ -47,7 +47,7 @@ def _check_symmetric(links: scipy.sparse.csr_array, name: str) -> None:
 
 
 def from_edges(
-    n_agents: int, edges: Any, name: str, *, directed: bool
+    n_agents: int, edges: object, name: str, *, directed: bool
 ) -> scipy.sparse.csr_array:
     """Return the links of pairs (receiver, sender), both ways unless the graph is directed.
 
@@ -73,7 +73,9 @@ def from_edges(
     return build_links(n_agents, pairs, name)
 
 
-def from_either(value: Any, n_agents: int | None, name: str) -> scipy.sparse.csr_array:
+def from_either(
+    value: object, n_agents: int | None, name: str
+) -> scipy.sparse.csr_array:
     """Return the links of a matrix or of a list of edges, both ways."""
     if scipy.sparse.issparse(value) or getattr(value, "dtype", None) == np.dtype(bool):
         return from_matrix(value, name, directed=False)
@@ -99,12 +101,26 @@ def _is_adjacency(numbers: np.ndarray, n_agents: int | None) -> bool:
     return not (size == 2 and looks_like_edges)
 
 
-def is_networkx(value: Any) -> bool:
+class NetworkxGraph(Protocol):
+    """What is used of a graph of networkx."""
+
+    @property
+    def nodes(self) -> Iterable[Hashable]: ...
+
+    @property
+    def edges(self) -> Iterable[tuple[Hashable, ...]]: ...
+
+    def is_directed(self) -> bool: ...
+
+
+def is_networkx(value: object) -> TypeGuard[NetworkxGraph]:
     """Return whether a value has the attributes of networkx's graphs."""
     return all(hasattr(value, name) for name in ("nodes", "edges", "is_directed"))
 
 
-def order_nodes(nodes: Sequence[Any], names: Sequence[Any]) -> Sequence[Any]:
+def order_nodes(
+    nodes: Sequence[Hashable], names: Sequence[Hashable]
+) -> Sequence[Hashable]:
     """Return the nodes of a networkx graph in the order of the agents.
 
     >>> order_nodes([3, 1, 2], [])
@@ -124,23 +140,25 @@ def order_nodes(nodes: Sequence[Any], names: Sequence[Any]) -> Sequence[Any]:
             raise ValueError(f"graph must have the nodes {list(names)}, got {nodes}")
         return order
     # Other labels have no order of their own.
-    return sorted(nodes) if _are_integers(nodes) else nodes
+    # The keys of integers are tuples too, so that all can be compared.
+    return sorted(nodes, key=_integers) if _are_integers(nodes) else nodes
 
 
-def _are_integers(nodes: Sequence[Any]) -> bool:
+def _are_integers(nodes: Sequence[Hashable]) -> bool:
     """Whether labels are integers, or tuples of as many integers each."""
-    tuples = [node if isinstance(node, tuple) else (node,) for node in nodes]
-    if (
-        len(
-            {
-                (type(node) is tuple, len(t))
-                for node, t in zip(nodes, tuples, strict=True)
-            }
-        )
-        > 1
-    ):
-        return False
-    return all(isinstance(label, Integral) for entries in tuples for label in entries)
+    kinds = set()
+    for node in nodes:
+        entries = node if isinstance(node, tuple) else (node,)
+        if not all(isinstance(entry, Integral) for entry in entries):
+            return False
+        kinds.add((type(node) is tuple, len(entries)))
+    return len(kinds) <= 1
+
+
+def _integers(node: Hashable) -> tuple[int, ...]:
+    """Return the integers of a label that is one, or a tuple of them."""
+    entries = node if isinstance(node, tuple) else (node,)
+    return tuple([int(entry) for entry in entries])
 
 
 def build_links(n_agents: int, pairs: Indices, name: str) -> scipy.sparse.csr_array:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
+from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from ..validation import (
 )
 from .faults import Faults
 from .graphs import Graph, as_graph
-from .ledger import Ledger, count_payload, mask_lost
+from .ledger import Counts, Ledger, Payload, count_payload, mask_lost
 from .weights import (
     ConsensusWeights,
     _check_same_links,
@@ -49,15 +50,35 @@ LossRule = Literal["mutual", "metropolis", "keep", "renormalise", "zero"]
 BeliefKind = Literal[
     "vectors", "ensembles", "gaussians", "mixtures", "densities", "particles"
 ]
-F = TypeVar("F", bound=Callable[..., Any])
+F = TypeVar("F", bound=Callable[..., object])
+P = TypeVar("P", bound=Payload)
+
+
+@dataclass(frozen=True)
+class _Size:
+    """The scalars and bytes of a round's messages: one number, or one for each link or agent.
+
+    Those of a `transmission` that reaches all receivers of an agent are None if each
+    message is a transmission of its own.
+    """
+
+    scalars: int | Counts
+    bytes: int | Counts
+    transmission: tuple[int | Counts, int | Counts] | None = None
+
+    @classmethod
+    def of_floats(cls, numbers: int) -> _Size:
+        """Return the size of so many floats, the same for all receivers."""
+        return cls(numbers, 8 * numbers, (numbers, 8 * numbers))
 
 
 class Channel:
     """Deliver payloads along a graph's links, lose or delay some, and charge for all of them.
 
     Everything that an agent learns from another passes through :meth:`broadcast` (any
-    payload, to all neighbours), :meth:`mix` (weighted sums of vectors, one sparse
-    product) or :meth:`send_on_links` (a different vector on each link).
+    payload, to all neighbours), :meth:`unicast` (any payload, a different one on each
+    link), :meth:`mix` (weighted sums of vectors, one sparse product) or
+    :meth:`send_on_links` (a different vector on each link).
 
     Parameters
     ----------
@@ -87,7 +108,7 @@ class Channel:
     @validated
     def __init__(
         self,
-        graph: Any,
+        graph: object,
         *,
         ledger: Ledger | None = None,
         runs: tuple[PositiveInt, ...] = (),
@@ -122,7 +143,7 @@ class Channel:
         with skip_validation():
             return cls(*args, **options)
 
-    def for_run(self, run: Any, ledger: Ledger) -> Channel:
+    def for_run(self, run: Indices, ledger: Ledger) -> Channel:
         """Return a copy with another ledger, for all runs of an array or for a single one.
 
         A single run, an array without axes, loses the messages that it loses among all.
@@ -142,7 +163,7 @@ class Channel:
             self._charge_mixing()
         return self._ledger
 
-    def broadcast(self, payloads: Sequence[Any]) -> list[dict[int, Any]]:
+    def broadcast(self, payloads: Sequence[P | None]) -> list[dict[int, P]]:
         """Let every agent send its payload to all that receive from it.
 
         Parameters
@@ -161,10 +182,13 @@ class Channel:
             and integers become floats there.
         """
         graph = self.graph
-        sent, scalars, bytes_ = count_payload(payloads, graph.n_agents, self.runs)
+        copies, scalars, bytes_ = count_payload(payloads, graph.n_agents, self.runs)
+        # Copies have the types of what was given.
+        sent = cast(list[P], copies)
         # A link is used if its sender is not silent.
         sends = np.array([payload is not None for payload in sent])
-        arrived = self._transmit(sends[graph.senders], scalars, bytes_)
+        size = _Size(scalars[graph.senders], bytes_[graph.senders], (scalars, bytes_))
+        arrived = self._transmit(sends[graph.senders], size)
         # A message is in the inbox if any run has received it.
         received = np.flatnonzero(arrived.any(axis=0))
         inbox = _group_by_receiver(graph, sent, received)
@@ -174,8 +198,61 @@ class Channel:
             receiver = int(graph.receivers[link])
             sender = int(graph.senders[link])
             by_run = arrived[:, link].reshape(self.runs)
-            inbox[receiver][sender] = mask_lost(sent[sender], by_run)
+            masked = mask_lost(inbox[receiver][sender], by_run)
+            inbox[receiver][sender] = cast(P, masked)
         return inbox
+
+    def unicast(
+        self,
+        payloads: Sequence[P | None],
+        *,
+        common: Sequence[Payload | None] | None = None,
+    ) -> list[P | None]:
+        """Let every agent send a payload of its own on each of its links.
+
+        Parameters
+        ----------
+        payloads : sequence of length E
+            Per link, in the order of ``graph.receivers`` and ``graph.senders``, a
+            payload as for :meth:`broadcast`, or None for silence.
+        common : sequence of length A, optional
+            Per agent the payload that serves all its receivers in one transmission, for
+            the bill by broadcast; without it each message is a transmission of its own.
+
+        Returns
+        -------
+        list of length E
+            What arrives on each link, None where nothing does; lost entries are NaN as
+            for :meth:`broadcast`.
+
+        Examples
+        --------
+        >>> channel = Channel(Graph.from_edges(2, [(0, 1)]))
+        >>> channel.unicast([np.array([1.0, 2.0]), None])
+        [array([1., 2.]), None]
+        >>> channel.ledger.scalars
+        array([0, 2])
+        """
+        graph = self.graph
+        n_links = graph.senders.size
+        copies, scalars, bytes_ = count_payload(payloads, n_links, self.runs)
+        sent = cast(list[P | None], copies)
+        transmission = None
+        if common is not None:
+            _, *transmission_size = count_payload(common, graph.n_agents, self.runs)
+            transmission = (transmission_size[0], transmission_size[1])
+        used = np.array([payload is not None for payload in sent], dtype=bool)
+        arrived = self._transmit(used, _Size(scalars, bytes_, transmission))
+        result: list[P | None] = []
+        for link, payload in enumerate(sent):
+            if payload is None or not arrived[:, link].any():
+                result.append(None)
+            elif arrived[:, link].all():
+                result.append(payload)
+            else:
+                by_run = arrived[:, link].reshape(self.runs)
+                result.append(cast(P, mask_lost(payload, by_run)))
+        return result
 
     @validated
     def mix(
@@ -222,6 +299,7 @@ class Channel:
         *,
         links: Annotated[MaskInput, "self.graph.senders.size"] | None = None,
         acknowledged: bool = False,
+        is_broadcast: bool = False,
     ) -> Array:
         """Send a different payload along each link.
 
@@ -235,6 +313,9 @@ class Channel:
             charged.
         acknowledged : bool
             Charge an acknowledgement of one byte for each message, to its receiver.
+        is_broadcast : bool
+            Whether an agent's messages are equal on all its links, so that one
+            transmission carries them in the bill by broadcast.
 
         Returns
         -------
@@ -242,7 +323,10 @@ class Channel:
             The same values, with NaN where nothing arrives.
         """
         arrived = self._transmit_numbers(
-            values.shape[-1], links, acknowledged=acknowledged
+            values.shape[-1],
+            links,
+            acknowledged=acknowledged,
+            is_broadcast=is_broadcast,
         )
         by_run = arrived.reshape(*self.runs, self.graph.senders.size)
         return np.where(by_run[..., None], values, np.nan)
@@ -292,7 +376,7 @@ class Channel:
             used = np.ones(self.graph.senders.size, dtype=bool)
             count = min(rounds, block)
             arrived = self._transmit_rounds(
-                count, used, numbers, 8 * numbers, acknowledged=both_ways
+                count, used, _Size.of_floats(numbers), acknowledged=both_ways
             )
             rounds -= count
             for mixed, self_weights in self._mix_block(flat, weights, arrived, on_loss):
@@ -356,20 +440,17 @@ class Channel:
         links: Mask | None = None,
         *,
         acknowledged: bool = False,
+        is_broadcast: bool = True,
     ) -> Mask:
         """Send so many floats over some links, all by default; which arrive, (R, E)."""
         if links is None:
             links = np.ones(self.graph.senders.size, dtype=bool)
-        return self._transmit(links, numbers, 8 * numbers, acknowledged=acknowledged)
+        size = _Size.of_floats(numbers)
+        if not is_broadcast:
+            size = _Size(numbers, 8 * numbers)
+        return self._transmit(links, size, acknowledged=acknowledged)
 
-    def _transmit(
-        self,
-        used: Mask,
-        scalars: Any,
-        bytes_: Any,
-        *,
-        acknowledged: bool = False,
-    ) -> Mask:
+    def _transmit(self, used: Mask, size: _Size, *, acknowledged: bool = False) -> Mask:
         """Charge one round on the links in use, and return which messages arrive, (R, E)."""
         if self.faults.total_delay:
             raise ValueError(
@@ -377,94 +458,105 @@ class Channel:
                 f"got one of {self.faults.total_delay} rounds"
             )
         if not self._perfect:
-            arrived = self._transmit_rounds(
-                1, used, scalars, bytes_, acknowledged=acknowledged
-            )
+            arrived = self._transmit_rounds(1, used, size, acknowledged=acknowledged)
             return np.asarray(arrived[0])
+        self._charge(used[None], size, acknowledged=acknowledged)
         everywhere = np.broadcast_to(used, (self._n_drawn, used.size))
-        messages = self._count_by_agent(self.graph.senders[used])
-        ledger = self._charge(self.ledger, messages, scalars, bytes_)
-        if acknowledged:
-            # One byte back for each message, in the same round.
-            replies = self._count_by_agent(self.graph.receivers[used])
-            ledger = self._charge(ledger, replies, 0, 1, rounds=0)
-        self._ledger = ledger
         return np.asarray(everywhere[self._drawn])
 
     def _transmit_rounds(
-        self, count: int, used: Mask, scalars: Any, bytes_: Any, *, acknowledged: bool
+        self, count: int, used: Mask, size: _Size, *, acknowledged: bool
     ) -> Mask:
         """Charge some rounds with faults, and return which messages arrive, (count, R, E)."""
         graph = self.graph
-        ledger = self.ledger
+        first = self.ledger.rounds
         # A graph without links has no rounds, so that their number does not grow.
         step = 1 if graph.senders.size else 0
-        rounds = [ledger.rounds + k * step for k in range(count)]
+        rounds = [first + k * step for k in range(count)]
         # Radios that are off send nothing, which costs nothing.
         on = [self.faults.active_links(graph, round_, self.t) for round_ in rounds]
         used_by_round = used & np.array(on)
         draws = self.faults.draw_rounds(
-            graph, range(rounds[0], rounds[0] + count), self._n_drawn, self.t
+            graph, range(first, first + count), self._n_drawn, self.t
         )
         arrived = used_by_round[:, None] & ~draws[:, self._drawn]
         # The ledger has the mean over the runs, and the sum over rounds one after the other.
         missing = (used_by_round[:, None] & ~arrived).mean(axis=1)
-        lost = ledger.lost
+        lost = self.ledger.lost
         for row in missing:
             lost = lost + self._count_by_agent(graph.senders, row)
-        uses = used_by_round.sum(axis=0)
-        messages = self._count_by_agent(graph.senders, uses).astype(np.int64)
-        # One byte back for each message, in the same round.
-        replies = np.zeros_like(messages)
-        if acknowledged:
-            replies = self._count_by_agent(graph.receivers, uses).astype(np.int64)
-        self._ledger = ledger.replace(
-            rounds=ledger.rounds + count * step,
-            messages=ledger.messages + messages + replies,
-            scalars=ledger.scalars + messages * scalars,
-            bytes=ledger.bytes + messages * bytes_ + replies,
-            lost=lost,
-        )
+        self._charge(used_by_round, size, acknowledged=acknowledged)
+        self._ledger = self._ledger.replace(lost=lost)
         return np.asarray(arrived)
 
-    def _count_by_agent(self, agents: Indices, weights: Array | None = None) -> Any:
-        return np.bincount(agents, weights, minlength=self.graph.n_agents)
+    def _count_by_agent(
+        self, agents: Indices, weights: Array | None = None
+    ) -> Counts | Array:
+        """Return how often each agent is named, or the sum of its weights."""
+        counts: Counts | Array = np.bincount(
+            agents, weights, minlength=self.graph.n_agents
+        )
+        return counts
 
     def _charge_mixing(self) -> None:
         """Enter rounds of mixing without faults, in which every link carries a message."""
-        messages = self.graph.out_degree.astype(np.int64)
-        for size, rounds in self._uncharged.items():
-            self._ledger = self._charge(
-                self._ledger, rounds * messages, size, 8 * size, rounds=rounds
-            )
+        uncharged = self._uncharged
         self._uncharged = {}
+        every_link = np.ones((1, self.graph.senders.size), dtype=bool)
+        for numbers, rounds in uncharged.items():
+            self._charge(every_link, _Size.of_floats(numbers), repeated=rounds)
 
     def _charge(
         self,
-        ledger: Ledger,
-        messages: Any,
-        scalars: Any,
-        bytes_: Any,
+        used_by_round: Mask,
+        size: _Size,
         *,
-        rounds: int = 1,
-        lost: Any = 0.0,
-    ) -> Ledger:
-        """Return the ledger after more rounds, with the agents' messages of these sizes."""
+        acknowledged: bool = False,
+        repeated: int = 1,
+    ) -> None:
+        """Enter the messages on links (rounds, E) of these sizes, some times, in both bills."""
+        graph = self.graph
+        # How often each link, and each agent for all its links at once, has sent.
+        uses = repeated * used_by_round.sum(axis=0)
+        messages = self._count_by_agent(graph.senders, uses)
+        scalars = self._count_by_agent(graph.senders, uses * size.scalars)
+        bytes_ = self._count_by_agent(graph.senders, uses * size.bytes)
+        bills = [messages, scalars, bytes_]
+        if size.transmission is None:
+            bills += bills
+        else:
+            sends = repeated * self._count_transmissions(used_by_round)
+            bills += [sends, *[sends * part for part in size.transmission]]
+        if acknowledged:
+            # One byte back for each message, in the same round.
+            replies = self._count_by_agent(graph.receivers, uses)
+            for k in (0, 2, 3, 5):
+                bills[k] = bills[k] + replies
+        ledger = self.ledger
+        names = ("messages", "scalars", "bytes")
+        names += ("transmissions", "broadcast_scalars", "broadcast_bytes")
+        totals: dict[str, Any] = {}
+        for name, amount in zip(names, bills, strict=True):
+            totals[name] = getattr(ledger, name) + np.asarray(amount, dtype=np.int64)
         # Without links there is no round.
-        if self.graph.senders.size == 0:
-            rounds = 0
-        return ledger.replace(
-            rounds=ledger.rounds + rounds,
-            messages=ledger.messages + messages,
-            scalars=ledger.scalars + messages * scalars,
-            bytes=ledger.bytes + messages * bytes_,
-            lost=ledger.lost + lost,
-        )
+        if graph.senders.size:
+            totals["rounds"] = ledger.rounds + repeated * len(used_by_round)
+        self._ledger = ledger.replace(**totals)
+
+    def _count_transmissions(self, used_by_round: Mask) -> Counts:
+        """Return in how many rounds each agent sends on any link, (A,)."""
+        graph = self.graph
+        if used_by_round.all():
+            return len(used_by_round) * (graph.out_degree > 0).astype(np.int64)
+        sends = np.zeros(graph.n_agents, dtype=np.int64)
+        for used in used_by_round:
+            sends += self._count_by_agent(graph.senders[used]) > 0
+        return sends
 
 
 def _group_by_receiver(
-    graph: Graph, sent: Sequence[Any], links: Indices
-) -> list[dict[int, Any]]:
+    graph: Graph, sent: Sequence[P], links: Indices
+) -> list[dict[int, P]]:
     """Return for each agent the messages on some links, ascending numbers, by sender."""
     senders = graph.senders[links].tolist()
     # Links are ordered by receiver: agent i has those from bounds[i] to before bounds[i
@@ -537,7 +629,7 @@ def fusion_rule(kind: BeliefKind) -> Callable[[F], F]:
     return declare
 
 
-def kind_of_rule(rule: Callable[..., Any]) -> str | None:
+def kind_of_rule(rule: Callable[..., object]) -> str | None:
     """Return the kind of belief that a rule declares, through partials; None without a declaration.
 
     >>> from distfilt.network import average_consensus

@@ -294,7 +294,9 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: PositiveInt) -> Arra
     received = np.zeros((*channel.runs, graph.senders.size, mass.shape[-1]))
     for _ in range(rounds):
         pushed = pushed + part * mass
-        arrived = channel.send_on_links(pushed[..., graph.senders, :])
+        arrived = channel.send_on_links(
+            pushed[..., graph.senders, :], is_broadcast=True
+        )
         # Where a message is lost the last sum stays, and the next one brings both
         # increases.
         latest = np.where(np.isnan(arrived), received, arrived)
@@ -333,7 +335,9 @@ def max_consensus(
     # more.
     row_starts = graph.links.indptr[:-1]
     for _ in range(rounds or graph.diameter):
-        arrived = channel.send_on_links(largest[..., graph.senders, :])
+        arrived = channel.send_on_links(
+            largest[..., graph.senders, :], is_broadcast=True
+        )
         # fmax passes over NaN, a lost message.
         received = np.fmax.reduceat(arrived, row_starts, axis=-2)
         largest = np.fmax(largest, received)

@@ -82,7 +82,9 @@ def event_triggered(
         present = x[graph.senders]
         # NaN compares as False, so that values never delivered are sent.
         unchanged = np.abs(present - delivered).max(axis=1) <= threshold
-        arrived = channel.send_on_links(present, links=~unchanged, acknowledged=faulty)
+        arrived = channel.send_on_links(
+            present, links=~unchanged, acknowledged=faulty, is_broadcast=True
+        )
         delivered = np.where(np.isnan(arrived), delivered, arrived)
         # x̂_j - x̂_i over each link; zero as long as one of the two is missing.
         change = link_weights * (delivered - delivered[graph.reverse])

@@ -278,7 +278,7 @@ class Faults(FrozenModel):
         return _mix_bits(_mix_bits(keys)[:, None] ^ numbers)
 
 
-def _check_windows(during: Any) -> tuple[tuple[float, float], ...]:
+def _check_windows(during: object) -> tuple[tuple[float, float], ...]:
     """Return windows as pairs of numbers."""
     ends = check_array(during, "during", finite=False)
     if ends.ndim != 2 or ends.shape[1] != 2 or not (ends[:, 0] < ends[:, 1]).all():

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import scipy
@@ -64,7 +64,7 @@ class Graph(FrozenModel):
 
     @classmethod
     @validated
-    def from_adjacency(cls, adjacency: Any, *, directed: bool = False) -> Graph:
+    def from_adjacency(cls, adjacency: object, *, directed: bool = False) -> Graph:
         """Build a graph from a matrix of zeros and ones, an array or sparse.
 
         Parameters
@@ -104,7 +104,7 @@ class Graph(FrozenModel):
         )
 
     @classmethod
-    def from_networkx(cls, graph: Any, names: Sequence[str] = ()) -> Graph:
+    def from_networkx(cls, graph: object, names: Sequence[str] = ()) -> Graph:
         """Build a graph from a networkx one.
 
         Parameters
@@ -338,7 +338,7 @@ class Graph(FrozenModel):
 
 
 def as_graph(
-    value: Any, n_agents: int | None = None, names: Sequence[str] = ()
+    value: object, n_agents: int | None = None, names: Sequence[str] = ()
 ) -> Graph:
     """Return a graph from any description of one.
 

@@ -31,23 +31,36 @@ Payload = Part | tuple[Part, ...]
 class Ledger(FrozenModel):
     """Counts of all that the agents sent: the cost of a distributed method.
 
-    A message is one payload on one link, also if it is lost. A batch of independent
-    runs counts once: each run is a network of its own.
+    There are two bills. By link, a message is one payload on one link, also if it is
+    lost, as over cables or directed radio links. By broadcast, one transmission reaches
+    all receivers of an agent. A batch of independent runs counts once: each run is a
+    network of its own.
 
     Parameters
     ----------
     rounds : int
         Rounds of communication; a graph without links has none.
     messages, scalars, bytes : ndarray of int, (A,)
-        Sent by each agent, acknowledgements included.
+        Sent by each agent over its links, acknowledgements included.
     lost : ndarray, (A,)
         Number of each agent's messages that did not arrive; the mean over a batch's
         runs.
+    transmissions, broadcast_scalars, broadcast_bytes : ndarray of int, (A,)
+        The same bill if one transmission reaches all receivers: only messages that
+        differ between an agent's links are transmissions of their own.
 
     Examples
     --------
     >>> Ledger.empty(2)
     Ledger(rounds=0, messages=0, scalars=0, bytes=0, lost=0)
+
+    Agent 0 of a star has three receivers:
+
+    >>> from distfilt.network import Channel, graphs
+    >>> channel = Channel(graphs.star(4))
+    >>> _ = channel.broadcast([np.zeros(2), None, None, None])
+    >>> channel.ledger.scalars, channel.ledger.broadcast_scalars
+    (array([6, 0, 0, 0]), array([2, 0, 0, 0]))
     """
 
     rounds: NonNegativeInt
@@ -55,6 +68,9 @@ class Ledger(FrozenModel):
     scalars: Annotated[Counts, "A"]
     bytes: Annotated[Counts, "A"]
     lost: Annotated[Array, "A"]
+    transmissions: Annotated[Counts, "A"]
+    broadcast_scalars: Annotated[Counts, "A"]
+    broadcast_bytes: Annotated[Counts, "A"]
 
     @classmethod
     @validated
@@ -66,7 +82,8 @@ class Ledger(FrozenModel):
         ValueError: agents must be at least 1, got 0
         """
         zeros = np.zeros(agents, dtype=np.int64)
-        return cls.construct(0, zeros, zeros, zeros, np.zeros(agents))
+        lost = np.zeros(agents)
+        return cls.construct(0, zeros, zeros, zeros, lost, zeros, zeros, zeros)
 
     def __repr__(self) -> str:
         names = ("messages", "scalars", "bytes", "lost")
@@ -75,7 +92,7 @@ class Ledger(FrozenModel):
 
 
 def count_payload(
-    payloads: Any, agents: int, runs: tuple[int, ...]
+    payloads: object, agents: int, runs: tuple[int, ...]
 ) -> tuple[list[Payload | None], Counts, Counts]:
     """Return read-only copies of the agents' payloads, and their scalars and bytes.
 
@@ -116,22 +133,24 @@ def count_payload(
     return sent, np.array(scalars), np.array(bytes_)
 
 
-def _copy_part(part: Any, agent: int, runs: tuple[int, ...]) -> Part:
+def _copy_part(part: object, agent: int, runs: tuple[int, ...]) -> Part:
     """Return a read-only copy of an array, or refuse anything else."""
     # A masked array's mask, or an object, could carry numbers that are not counted.
-    plain = isinstance(part, np.ndarray) and not isinstance(part, np.ma.MaskedArray)
-    if not plain or part.dtype.kind not in "biuf":
-        name = f"dtype {part.dtype}" if plain else type(part).__name__
+    plain = part if isinstance(part, np.ndarray) else None
+    if isinstance(part, np.ma.MaskedArray):
+        plain = None
+    if plain is None or plain.dtype.kind not in "biuf":
+        name = type(part).__name__ if plain is None else f"dtype {plain.dtype}"
         raise InvalidArgumentError(
             f"payloads[{agent}] must be an array of real numbers, a flat tuple of them "
             f"or None, got {name}"
         )
-    if part.shape[: len(runs)] != runs:
+    if plain.shape[: len(runs)] != runs:
         raise ValueError(
-            f"payloads[{agent}] must have leading axes {runs}, got shape {part.shape}"
+            f"payloads[{agent}] must have leading axes {runs}, got shape {plain.shape}"
         )
     # The sender may go on computing in its own array.
-    copy: Part = np.array(part)
+    copy: Part = np.array(plain)
     copy.flags.writeable = False
     return copy
 
@@ -145,10 +164,14 @@ def _count_present(part: Part, n_runs: int) -> int:
     return int(present.any(axis=0).sum())
 
 
-def mask_lost(payload: Any, arrived: Mask) -> Any:
+def mask_lost(payload: Payload, arrived: Mask) -> Payload:
     """Return read-only copies of a payload with NaN in the runs that lost the message."""
     if isinstance(payload, tuple):
-        return tuple([mask_lost(part, arrived) for part in payload])
+        return tuple([_mask_part(part, arrived) for part in payload])
+    return _mask_part(payload, arrived)
+
+
+def _mask_part(payload: Part, arrived: Mask) -> Part:
     # One flag for each run, for all of the payload's other axes.
     axes = (1,) * (payload.ndim - arrived.ndim)
     masked = np.where(arrived.reshape(arrived.shape + axes), payload, np.nan)

@@ -19,6 +19,7 @@ from ..validation import (
 )
 from .channel import Channel, PerAgent
 from .consensus import _warn_if_disconnected
+from .graphs import Graph
 from .weights import UnstableGain, _laplacian_weights
 
 __all__ = ["PIState", "pi_start", "pi_step", "stable_substeps"]
@@ -35,6 +36,8 @@ class PIState(FrozenModel):
     estimate, integral : ndarray, (*runs, A, k)
         Each agent's estimate ν of the average input, and its integral η, which starts
         at zero.
+    graph : Graph, optional
+        The graph of the step that led to this state; None at the start.
 
     Examples
     --------
@@ -45,6 +48,7 @@ class PIState(FrozenModel):
 
     estimate: Annotated[Array, "... A k"]
     integral: Annotated[Array, "... A k"]
+    graph: Graph | None = None
 
 
 @validated
@@ -162,7 +166,8 @@ def pi_step(
         by `rate`, or not at all.
     channel : Channel
         Links both ways. Each substep is a round of 2k scalars a link. A link that loses
-        a message is not used in that round.
+        a message is not used in that round. A second step on the same graph gives a
+        :class:`Disconnected` warning if that graph has several components.
     dt : float
         The step, in s.
     alpha, a, b : float
@@ -184,9 +189,10 @@ def pi_step(
     array([2., 2.])
     """
     channel.graph._check_undirected()
-    # Every step is one of many, whatever the number of its substeps: parts that stay apart in
-    # a fixed graph have an average each.
-    _warn_if_disconnected(channel)
+    # Parts that stay apart in a fixed graph have an average each. A graph that changes from
+    # step to step may be connected over time; one that is used again is taken as fixed.
+    if channel.graph is state.graph:
+        _warn_if_disconnected(channel)
     if state.estimate.shape != inputs.shape:
         raise ValueError(
             f"state must have shape {inputs.shape}, got {state.estimate.shape}"
@@ -214,4 +220,4 @@ def pi_step(
         drift = alpha * (u - nu) + slope
         nu = nu + h * drift + a * proportional - b * integral
         eta = eta + b * proportional
-    return PIState.construct(nu, eta)
+    return PIState.construct(nu, eta, channel.graph)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, TypedDict
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -332,7 +332,14 @@ def range_bearing(
     )
 
 
-def _geometry(indices: Sequence[int], origin: Array | None) -> dict[str, Any]:
+class _Geometry(TypedDict):
+    """The arguments that the functions below share."""
+
+    indices: Sequence[int]
+    origin: Array
+
+
+def _geometry(indices: Sequence[int], origin: Array | None) -> _Geometry:
     """Return the components that form a place, and the place of the sensor as an own copy."""
     # A copy: the caller's array may be that of a robot that moves on.
     place = np.array(0.0 if origin is None else origin)

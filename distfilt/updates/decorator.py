@@ -103,7 +103,7 @@ def update(function: F) -> F:
         # An argument that is left out is the function's own error.
         if len(arrays) == len(data):
             arguments.update(_share_leading_axes(arrays))
-        return cast(Array, call_user(function, **arguments))
+        return call_user(function, **arguments)
 
     checked: Any = validated(function, call=call_checked, annotations=annotations)
     # A tag, see `has_tag`: it takes a stack of ensembles in one call.
@@ -232,14 +232,14 @@ def with_missing(
     if np.isfinite(observed).all() and np.isfinite(predicted).all():
         stream = _stream(rng, seed, m, lead)
         result = call_user(update, ensemble, predicted, observed, noise, rng=stream)
-        return cast(Array, result)
+        return result
     # A component needs a value, and a prediction of every member.
     present = ~np.isnan(observed) & ~np.isnan(predicted).any(axis=-2)
     if has_tag(update, "accepts_missing"):
         marked = np.where(present, observed, np.nan)
         stream = _stream(rng, seed, m, lead)
         result = call_user(update, ensemble, predicted, marked, noise, rng=stream)
-        return cast(Array, result)
+        return result
     return _update_by_pattern(
         update, (ensemble, predicted, observed, noise), present, rng, seed
     )

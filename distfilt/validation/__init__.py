@@ -16,11 +16,11 @@ Annotation                                Allowed values, and the function's val
 ``PositiveFloat``, ``UnitInterval`` …     numbers in bounds; or ``Annotated[float, Bounds(…)]``
 ``Literal["a", "b"]``                     one of these words
 ``Rng``                                   a ``numpy.random.Generator``
-``Callable[..., Any]``                    a function
+``Callable[..., object]``                    a function
 ``Graph``, any other class                an instance
 ``Sequence[X]``, ``tuple[X, ...]``        any sequence of such values, as a tuple
 ``X | Y``, ``X | None``                   a value that fits one of them
-``Any``, ``ArrayLike``                    any value, unchanged
+``object``, ``Any``, ``ArrayLike``        any value, unchanged
 ========================================  ==========================================================
 
 In a shape each word names the size of an axis. A number is exact, and so is the name of an argument
@@ -38,14 +38,15 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .annotations import ALLOW_NAN
 from .batching import call_batched
 from .checks import (
     Array,
     Bounds,
+    Indices,
     InvalidArgumentError,
+    Mask,
     all_finite,
     check_array,
     check_distinct,
@@ -99,9 +100,6 @@ __all__ = [
     "validated",
 ]
 
-# Arrays as inner functions and results have them.
-Mask = NDArray[np.bool_]
-Indices = NDArray[np.intp]
 Rng = np.random.Generator
 
 # Arguments that may be array_like: any value for a type checker, checked when a function is called.

@@ -6,14 +6,18 @@ import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from types import EllipsisType, UnionType
+from typing import Annotated, Any, Literal, TypeAlias, Union, get_args, get_origin
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .checks import (
+    Array,
+    Indices,
     InvalidArgumentError,
+    Mask,
+    Shape,
     check_array,
     describe_misshape,
     format_shape,
@@ -31,7 +35,7 @@ ALLOW_NAN = "missing allowed"
 class CallContext:
     """The arguments of one call by name, and the dimensions that their shapes have bound."""
 
-    arguments: dict[str, Any]
+    arguments: dict[str, object]
     dimensions: dict[str, int] = field(default_factory=dict)
 
     def bind_shape(self, shape: tuple[int, ...], expected: ShapeNames) -> bool:
@@ -47,19 +51,19 @@ class CallContext:
             self.dimensions = dimensions
         return matches
 
-    def resolve(self, names: Sequence[Any]) -> tuple[Any, ...]:
+    def resolve(self, names: Shape) -> Shape:
         """Replace the names of dimensions that are known by their sizes."""
-        shape: list[Any] = []
+        shape: list[int | str | EllipsisType] = []
         for name in names:
             size = self._size(name) if isinstance(name, str) else name
             # A tuple stands for several axes, such as the axes of runs.
-            if type(size) is tuple:
+            if isinstance(size, tuple):
                 shape.extend(size)
             else:
                 shape.append(size)
         return tuple(shape)
 
-    def _size(self, name: str) -> Any:
+    def _size(self, name: str) -> int | str | tuple[int, ...]:
         """Return a dimension's size, sizes of several axes, or the name while it is free."""
         if name in self.dimensions:
             return self.dimensions[name]
@@ -70,21 +74,23 @@ class CallContext:
             if value is None:
                 return name  # an optional argument that is absent binds nothing
             value = getattr(value, attribute)
-        return value if isinstance(value, int | np.integer | tuple) else name
+        if isinstance(value, np.integer):
+            return int(value)
+        return value if isinstance(value, int | tuple) else name
 
 
 @dataclass(frozen=True)
 class ShapeNames:
     """The dimensions of a declared shape."""
 
-    names: tuple[Any, ...]
+    names: Shape
     # The first part of each name, which may be an argument of the call.
     references: frozenset[str]
 
     @classmethod
     def parse(cls, words: Sequence[str]) -> ShapeNames:
         """Read the words of a shape such as ``"... N model.dim"``."""
-        names: list[Any] = []
+        names: list[int | str | EllipsisType] = []
         for word in words:
             if word.isdigit():
                 names.append(int(word))
@@ -94,16 +100,20 @@ class ShapeNames:
         return cls(tuple(names), frozenset(references))
 
 
+Converter: TypeAlias = Callable[[object, str, CallContext], object]
+Rule: TypeAlias = Callable[[object, str], None]
+
+
 @dataclass(frozen=True)
 class ArgumentConstraint:
     """The values that an argument may have: a description, a conversion, and further rules."""
 
     description: str
-    convert: Callable[[Any, str, CallContext], Any]
-    rules: tuple[Callable[[Any, str], None], ...] = ()
+    convert: Converter
+    rules: tuple[Rule, ...] = ()
     has_shape: bool = False
 
-    def validate(self, value: Any, name: str, context: CallContext) -> Any:
+    def validate(self, value: object, name: str, context: CallContext) -> object:
         """Return the value as the function gets it, or raise an error that names it.
 
         A conversion raises TypeError for a value of a wrong type.
@@ -123,55 +133,55 @@ class ArgumentConstraint:
         return result
 
 
-def _convert_float(value: Any, name: str, context: CallContext) -> float:
+def _convert_float(value: object, name: str, context: CallContext) -> float:
     # These types need no array; all others go through its conversion, which refuses most.
-    number = value
-    if type(value) not in (float, int, np.float64):
-        try:
-            number = check_array(value, name, ())
-        except ValueError:
-            raise TypeError from None
     try:
-        result = float(number)
-    except OverflowError:  # an integer of hundreds of digits
+        if isinstance(value, float | int) and not isinstance(value, bool):
+            result = float(value)
+        else:
+            result = float(check_array(value, name, ()))
+    except (ValueError, OverflowError):  # an integer may have hundreds of digits
         raise TypeError from None
     if not math.isfinite(result):
         raise TypeError
     return result
 
 
-def _convert_int(value: Any, name: str, context: CallContext) -> int:
+def _convert_int(value: object, name: str, context: CallContext) -> int:
     # A bool is an int in Python, and a timedelta an integer in numpy.
-    is_integer = isinstance(value, int | np.integer)
-    if not is_integer or isinstance(value, bool | np.timedelta64):
+    if isinstance(value, bool | np.timedelta64):
+        raise TypeError
+    if not isinstance(value, int | np.integer):
         raise TypeError
     return int(value)
 
 
-def _convert_bool(value: Any, name: str, context: CallContext) -> bool:
+def _convert_bool(value: object, name: str, context: CallContext) -> bool:
     if not isinstance(value, bool | np.bool_):
         raise TypeError
     return bool(value)
 
 
-def _check_text(value: Any, name: str, context: CallContext) -> str:
+def _check_text(value: object, name: str, context: CallContext) -> str:
     if not isinstance(value, str) or not value.strip():
         raise TypeError
     return value
 
 
-def _check_instance(cls: Any, value: Any, name: str, context: CallContext) -> Any:
+def _check_instance(
+    cls: type, value: object, name: str, context: CallContext
+) -> object:
     if not isinstance(value, cls):
         raise TypeError
     return value
 
 
-def _check_callable(value: Any, name: str, context: CallContext) -> Any:
+def _check_callable(value: object, name: str, context: CallContext) -> object:
     if not callable(value):
         raise TypeError
-    constraints = None
-    if isinstance(value, partial):
-        constraints = getattr(value.func, "signature_constraints", None)
+    if not isinstance(value, partial):
+        return value
+    constraints = getattr(value.func, "signature_constraints", None)
     if constraints is None:
         return value
     # Nested calls are not checked, so a partial's options are checked here.
@@ -180,8 +190,8 @@ def _check_callable(value: Any, name: str, context: CallContext) -> Any:
 
 
 def _check_option(
-    options: tuple[Any, ...], value: Any, name: str, context: CallContext
-) -> Any:
+    options: tuple[object, ...], value: object, name: str, context: CallContext
+) -> object:
     for option in options:
         # Types are compared first: 1 == True, and an array compares entry by entry.
         if type(value) is type(option) and value == option:
@@ -193,16 +203,16 @@ def _convert_array(
     dtype: type,
     shape: ShapeNames | None,
     allow_nan: bool,
-    value: Any,
+    value: object,
     name: str,
     context: CallContext,
-) -> Any:
+) -> Array | Mask | Indices:
     """Return an array of a dtype and shape.
 
     :meth:`ArgumentConstraint.validate` gives a bare TypeError its message.
     """
     if dtype is np.float64:
-        array: Any = check_array(value, name, finite=not allow_nan)
+        array: Array | Mask | Indices = check_array(value, name, finite=not allow_nan)
         if allow_nan and np.isinf(array).any():
             raise ValueError(
                 f"{name} must have finite numbers or NaN (missing), got infinity"
@@ -234,8 +244,8 @@ def _find_column(shape: tuple[int, ...], context: CallContext) -> str:
 
 
 def _convert_sequence(
-    entry: ArgumentConstraint | None, value: Any, name: str, context: CallContext
-) -> tuple[Any, ...]:
+    entry: ArgumentConstraint | None, value: object, name: str, context: CallContext
+) -> tuple[object, ...]:
     entries = _to_tuple(value)
     if entry is None:
         return entries
@@ -244,10 +254,10 @@ def _convert_sequence(
 
 def _convert_tuple(
     constraints: tuple[ArgumentConstraint | None, ...],
-    value: Any,
+    value: object,
     name: str,
     context: CallContext,
-) -> tuple[Any, ...]:
+) -> tuple[object, ...]:
     entries = _to_tuple(value)
     if len(entries) != len(constraints):
         raise ValueError(
@@ -261,7 +271,7 @@ def _convert_tuple(
     return tuple(result)
 
 
-def _to_tuple(value: Any) -> tuple[Any, ...]:
+def _to_tuple(value: object) -> tuple[object, ...]:
     """Return the entries of a sequence; a string or a mapping is none."""
     if isinstance(value, str | bytes | Mapping) or not np.iterable(value):
         raise TypeError
@@ -271,10 +281,10 @@ def _to_tuple(value: Any) -> tuple[Any, ...]:
 def _convert_union(
     alternatives: tuple[ArgumentConstraint, ...],
     optional: bool,
-    value: Any,
+    value: object,
     name: str,
     context: CallContext,
-) -> Any:
+) -> object:
     if value is None and optional:
         return None
     for constraint in alternatives:
@@ -287,7 +297,7 @@ def _convert_union(
 
 
 def _is_out_of_bounds(
-    value: Any, constraint: ArgumentConstraint, error: ValueError
+    value: object, constraint: ArgumentConstraint, error: ValueError
 ) -> bool:
     """Whether a number has the right type for a constraint, and breaks one of its rules.
 
@@ -316,7 +326,7 @@ _SEQUENCES = (Sequence, Collection, Iterable, tuple, list)
 
 
 @cache
-def make_constraint(annotation: Any) -> ArgumentConstraint | None:
+def make_constraint(annotation: object) -> ArgumentConstraint | None:
     """Return the constraint that an annotation declares, or None if any value is allowed.
 
     Examples
@@ -326,7 +336,7 @@ def make_constraint(annotation: Any) -> ArgumentConstraint | None:
     Traceback (most recent call last):
     ValueError: members must be at least 1, got 0
     """
-    if annotation is Any or annotation == ArrayLike:
+    if annotation in (Any, object, ArrayLike):
         return None
     annotation = _resolve_alias(annotation)
     # Annotated[X, ...] has the origin Annotated, Sequence[X] the origin Sequence.
@@ -353,13 +363,13 @@ def make_constraint(annotation: Any) -> ArgumentConstraint | None:
     )
 
 
-def _make_sequence(origin: Any, args: tuple[Any, ...]) -> ArgumentConstraint:
+def _make_sequence(origin: object, args: tuple[object, ...]) -> ArgumentConstraint:
     """Return the constraint of a sequence of any length, or of a tuple of a fixed one."""
     # tuple[X, Y] has a fixed length, tuple[X, ...] any.
     if origin is tuple and args[-1] is not ...:
         constraints = tuple([make_constraint(arg) for arg in args])
         description = f"a tuple of {_describe(constraints, ', ')}"
-        convert: Any = partial(_convert_tuple, constraints)
+        convert: Converter = partial(_convert_tuple, constraints)
     else:
         constraints = (make_constraint(args[0]),)
         description = f"a sequence, each entry {_describe(constraints, '')}"
@@ -367,7 +377,7 @@ def _make_sequence(origin: Any, args: tuple[Any, ...]) -> ArgumentConstraint:
     return ArgumentConstraint(description, convert, has_shape=_have_shape(constraints))
 
 
-def _make_union(args: tuple[Any, ...]) -> ArgumentConstraint | None:
+def _make_union(args: tuple[object, ...]) -> ArgumentConstraint | None:
     """Return the constraint of a union, whose alternatives are tried in order."""
     alternatives = []
     for arg in args:
@@ -386,7 +396,9 @@ def _make_union(args: tuple[Any, ...]) -> ArgumentConstraint | None:
     )
 
 
-def _make_annotated(base: Any, metadata: tuple[Any, ...]) -> ArgumentConstraint | None:
+def _make_annotated(
+    base: object, metadata: tuple[object, ...]
+) -> ArgumentConstraint | None:
     """Return the constraint of a type with a shape and rules beside it.
 
     Of several shapes the last one counts, so that an alias with a shape can be narrowed.
@@ -403,12 +415,12 @@ def _make_annotated(base: Any, metadata: tuple[Any, ...]) -> ArgumentConstraint 
     if constraint is None:
         return None
     # Rules come after those of the alias that is annotated further.
-    rules = tuple([note for note in metadata if callable(note)])
+    rules: tuple[Rule, ...] = tuple([note for note in metadata if callable(note)])
     return replace(constraint, rules=constraint.rules + rules)
 
 
 def _make_array(
-    base: Any, words: Sequence[str] | None = None, allow_nan: bool = False
+    base: object, words: Sequence[str] | None = None, allow_nan: bool = False
 ) -> ArgumentConstraint:
     """Return the constraint of an array, of any shape if there are no words for it."""
     # NDArray[X] is ndarray[shape, dtype[X]].
@@ -423,7 +435,7 @@ def _make_array(
     return ArgumentConstraint(description, convert, has_shape=True)
 
 
-def _resolve_alias(annotation: Any) -> Any:
+def _resolve_alias(annotation: object) -> object:
     """Return the type that a ``type`` alias stands for; numpy's NDArray is one since 2.5."""
     args = get_args(annotation)
     value = getattr(get_origin(annotation) or annotation, "__value__", None)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .checks import Array
 from .decorators import call_user
@@ -13,11 +14,25 @@ from .first_use import mark_checked, needs_check
 
 __all__ = ["call_batched"]
 
+# A user's function may raise instead of returning an array; the error is looked at.
+Result = Array | Exception
+
+
+class HasDimension(Protocol):
+    """An object that holds a user's function and the length of its result."""
+
+    @property
+    def dim(self) -> int:
+        """Length of the function's result."""
+
+
 # Largest difference between batched and single results, relative to the state's change.
 _RELATIVE_TOLERANCE = 1e-2
 
 
-def call_batched(owner: Any, name: str, states: Sequence[Array], *args: float) -> Array:
+def call_batched(
+    owner: HasDimension, name: str, states: Sequence[Array], *args: float
+) -> Array:
     """Call a user's function on states (..., d), and return (..., ``owner.dim``).
 
     A function written for one state may return the right shape with wrong numbers. The first
@@ -65,8 +80,7 @@ def call_batched(owner: Any, name: str, states: Sequence[Array], *args: float) -
     result = _call_or_catch(function, states, args)
     expected = (*x.shape[:-1], owner.dim)
     has_shape = getattr(result, "shape", None) == expected  # an error has no shape
-    # A batch of one state cannot show whether rows are mixed, so it passes a weaker check.
-    check = name if x.size > x.shape[-1] else f"{name} of a single state"
+    check = name_of_check(name, x)
     if x.ndim > 1 and x.size and (not has_shape or needs_check(owner, check)):
         _compare_with_single_state(owner, name, states, args, result)
         if has_shape and _is_conclusive(x):
@@ -83,12 +97,20 @@ def call_batched(owner: Any, name: str, states: Sequence[Array], *args: float) -
     )
 
 
+def name_of_check(name: str, states: Array) -> str:
+    """Return the name of the check that a user's function of states (..., d) has to pass.
+
+    A batch of one state cannot show whether rows are mixed, so it passes a weaker check.
+    """
+    return name if states.size > states.shape[-1] else f"{name} of a single state"
+
+
 def _compare_with_single_state(
-    owner: Any,
+    owner: HasDimension,
     name: str,
     states: Sequence[Array],
     args: tuple[float, ...],
-    result: Any,
+    result: Result,
 ) -> None:
     """Raise if a batched result differs from the result for the last state alone."""
     function = getattr(owner, name)
@@ -96,7 +118,7 @@ def _compare_with_single_state(
     last_states = [state.reshape(-1, state.shape[-1])[-1] for state in states]
     single = _call_or_catch(function, last_states, args)
     _refuse_draws(name, single, _call_or_catch(function, last_states, args))
-    if getattr(result, "shape", None) == expected:
+    if isinstance(result, np.ndarray) and result.shape == expected:
         last_row = result.reshape(-1, owner.dim)[-1]
         differs = _is_different(last_row, single, last_states)
     else:
@@ -106,8 +128,8 @@ def _compare_with_single_state(
         for last, state in zip(last_states, states, strict=True):
             copies.append(np.broadcast_to(last, state.shape))
         repeated = _call_or_catch(function, copies, args)
-        takes_one = np.shape(single) == expected[-1:]
-        differs = takes_one and np.shape(repeated) != expected
+        takes_one = _shape_of(single) == expected[-1:]
+        differs = takes_one and _shape_of(repeated) != expected
     if differs:
         raise ValueError(
             f"{name} must take many states at once, (..., d), components last "
@@ -115,10 +137,11 @@ def _compare_with_single_state(
         )
 
 
-def _refuse_draws(name: str, first: Any, second: Any) -> None:
+def _refuse_draws(name: str, first: Result, second: Result) -> None:
     """Raise if two calls with the same state differ, as where noise is drawn inside."""
-    is_array = isinstance(first, np.ndarray) and isinstance(second, np.ndarray)
-    if not is_array or first.shape != second.shape:
+    if isinstance(first, Exception) or isinstance(second, Exception):
+        return
+    if first.shape != second.shape:
         return
     # A parallel sum may round differently each time.
     if not np.allclose(first, second, rtol=1e-9, atol=0.0, equal_nan=True):
@@ -138,8 +161,8 @@ def _is_conclusive(x: Array) -> bool:
 
 
 def _call_or_catch(
-    function: Callable[..., Any], states: Sequence[Array], args: tuple[float, ...]
-) -> Any:
+    function: Callable[..., ArrayLike], states: Sequence[Array], args: tuple[float, ...]
+) -> Result:
     """Return a function's result as an array, or the error that it raises."""
     copies = [state.copy() for state in states]
     try:
@@ -148,9 +171,14 @@ def _call_or_catch(
         return error
 
 
-def _is_different(row: Array, single: Any, states: Sequence[Array]) -> bool:
+def _shape_of(result: Result) -> tuple[int, ...] | None:
+    """Return the shape of an array; an error has none."""
+    return None if isinstance(result, Exception) else result.shape
+
+
+def _is_different(row: Array, single: Result, states: Sequence[Array]) -> bool:
     """Whether a row of a batch differs from the result for its state alone."""
-    if np.shape(single) != row.shape:
+    if isinstance(single, Exception) or single.shape != row.shape:
         # A function for two axes fails on one state; it may get three axes later.
         return isinstance(single, IndexError)
     # Solvers of adaptive step differ a little; wrong rows differ as much as the states change.

@@ -7,15 +7,19 @@ import math
 import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from types import EllipsisType
+from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf
 
 __all__ = [
     "InvalidArgumentError",
     "Array",
+    "Indices",
+    "Mask",
+    "Shape",
     "Bounds",
     "all_finite",
     "check_array",
@@ -31,6 +35,10 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Indices = NDArray[np.intp]
+# Sizes of axes, names of free ones, and a leading "..." for any further axes.
+Shape: TypeAlias = tuple[int | str | EllipsisType, ...]
 
 
 class InvalidArgumentError(ValueError, TypeError):
@@ -75,9 +83,9 @@ def type_name(value: object) -> str:
 
 
 def check_array(
-    value: ArrayLike,
+    value: object,
     name: str,
-    shape: tuple[Any, ...] | None = None,
+    shape: Shape | None = None,
     *,
     finite: bool = True,
 ) -> Array:
@@ -139,7 +147,7 @@ def all_finite(value: Array) -> bool:
     return bool(np.isfinite(value).all())
 
 
-def _convert_to_float64(value: Any, name: str) -> Array:
+def _convert_to_float64(value: object, name: str) -> Array:
     """Convert a value that holds real numbers and nothing else."""
     wrong_type = type_name(value)
     try:
@@ -147,8 +155,8 @@ def _convert_to_float64(value: Any, name: str) -> Array:
         parts = value if isinstance(value, list | tuple) else (value,)
         array = np.asarray(value)
         # An array of objects may hold numbers, and anything else.
-        entries: Any = array.ravel() if array.dtype.kind == "O" else ()
-        if len(entries):
+        entries = list(array.ravel()) if array.dtype.kind == "O" else []
+        if entries:
             wrong_type = type_name(entries[0])
         # Booleans, text and dates would be converted to numbers without an error.
         refused = [v for v in (*parts, *entries) if isinstance(v, _NOT_REAL)]
@@ -166,7 +174,7 @@ def _convert_to_float64(value: Any, name: str) -> Array:
 
 
 def match_shape(
-    shape: tuple[int, ...], expected: tuple[Any, ...], dimensions: dict[str, int]
+    shape: tuple[int, ...], expected: Shape, dimensions: dict[str, int]
 ) -> bool:
     """Whether a shape is as expected; if so its named dimensions are added to `dimensions`.
 
@@ -190,14 +198,14 @@ def match_shape(
     return not remaining
 
 
-def format_shape(shape: tuple[Any, ...]) -> str:
+def format_shape(shape: Shape) -> str:
     """Write a shape as numpy does, ``(..., N, 2)``."""
     names = ["..." if size is ... else str(size) for size in shape]
     text = ", ".join(names)
     return f"({text},)" if len(shape) == 1 else f"({text})"
 
 
-def describe_misshape(shape: tuple[int, ...], expected: tuple[Any, ...]) -> str:
+def describe_misshape(shape: tuple[int, ...], expected: Shape) -> str:
     """Return what to change about a column vector, or a number without an axis; mostly nothing.
 
     >>> describe_misshape((2, 1), (2,)), describe_misshape((), (..., 1))
@@ -385,7 +393,7 @@ class Bounds:
     below: float | None = None
     at_most: float | None = None
 
-    def __call__(self, value: Any, name: str) -> None:
+    def __call__(self, value: float | Array, name: str) -> None:
         """Refuse a number, or an array with an entry, that is out of bounds."""
         for side, compare in _COMPARISONS.items():
             bound = getattr(self, side)
@@ -396,7 +404,9 @@ class Bounds:
             if inside is True or np.all(inside):
                 continue
             # The number itself, not its type: 2.0, not np.float64(2.0).
-            outside = value if np.ndim(value) == 0 else value[~inside].flat[0].item()
+            outside = value
+            if isinstance(value, np.ndarray) and value.ndim:
+                outside = value[~inside].flat[0].item()
             raise ValueError(
                 f"{name} must be {_describe_bound(side, bound)}, got {outside!r}"
             )

@@ -8,9 +8,10 @@ from contextvars import ContextVar
 from functools import cached_property, partial, wraps
 from inspect import Parameter, signature
 from math import isfinite
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 from .annotations import FINITE_FLOAT, ArgumentConstraint, CallContext
+from .checks import InvalidArgumentError
 from .resolving import make_constraints
 
 __all__ = [
@@ -21,14 +22,17 @@ __all__ = [
     "validated",
 ]
 
-F = TypeVar("F", bound=Callable[..., Any])
+R = TypeVar("R")
+F = TypeVar("F", bound=Callable[..., object])
 
 
 class SignatureConstraints:
     """The constraints of a function's parameters, evaluated when it is first called."""
 
     def __init__(
-        self, function: Any, annotations: Mapping[str, Any] | None = None
+        self,
+        function: Callable[..., object],
+        annotations: Mapping[str, object] | None = None,
     ) -> None:
         self.function = function
         self.annotations = annotations
@@ -55,7 +59,7 @@ class SignatureConstraints:
         return tuple([p.name for p in parameters if p.kind in allowed])
 
     @cached_property
-    def defaults(self) -> dict[str, Any]:
+    def defaults(self) -> dict[str, object]:
         """Default values by parameter."""
         parameters = signature(self.function).parameters.values()
         return {
@@ -63,8 +67,8 @@ class SignatureConstraints:
         }
 
     def validate(
-        self, args: tuple[Any, ...], options: dict[str, Any]
-    ) -> dict[str, Any]:
+        self, args: tuple[object, ...], options: dict[str, object]
+    ) -> dict[str, object]:
         """Return the converted arguments by name, or raise an error for the first wrong one."""
         arguments = dict(zip(self.positional_names, args, strict=False)) | options
         if len(arguments) < len(args) + len(options):
@@ -76,9 +80,12 @@ class SignatureConstraints:
         for name, constraint in self.constraints.items():
             if name in arguments:
                 value = arguments[name]
-                is_float = type(value) is float
-                if constraint is FINITE_FLOAT and is_float and isfinite(value):
-                    # The most frequent case, a time, needs no conversion.
+                # The most frequent case, a time, needs no conversion.
+                if (
+                    constraint is FINITE_FLOAT
+                    and type(value) is float
+                    and isfinite(value)
+                ):
                     continue
                 value = constraint.validate(value, name, context)
                 # Later shapes refer to the converted value.
@@ -86,7 +93,7 @@ class SignatureConstraints:
                 context.arguments[name] = value
         return arguments
 
-    def _refuse_positions(self, args: tuple[Any, ...]) -> None:
+    def _refuse_positions(self, args: tuple[object, ...]) -> None:
         """Refuse more arguments by position than there are, naming those to give by name."""
         n_allowed = len(self.positional_names)
         parameters = signature(self.function).parameters.values()
@@ -130,8 +137,8 @@ _NESTED = _Flag()
 def validated(
     function: F,
     *,
-    call: Callable[..., Any] | None = None,
-    annotations: Mapping[str, Any] | None = None,
+    call: Callable[..., object] | None = None,
+    annotations: Mapping[str, object] | None = None,
 ) -> F:
     """Let a function's annotations check its arguments.
 
@@ -177,7 +184,7 @@ def validated(
     outermost = function if call is None else call
 
     @wraps(function)
-    def wrapper(*args: Any, **options: Any) -> Any:
+    def wrapper(*args: object, **options: object) -> object:
         # Arguments of a nested call come from the library.
         if _NESTED.get():
             return function(*args, **options)
@@ -213,7 +220,9 @@ def skip_validation() -> Iterator[None]:
         _NESTED.reset(token)
 
 
-def check_signature(function: Any, name: str, parameters: str) -> None:
+def check_signature(
+    function: Callable[..., object], name: str, parameters: str
+) -> None:
     """Refuse a function that cannot be called with these parameters, such as "x, t, dt".
 
     Examples
@@ -234,7 +243,7 @@ def check_signature(function: Any, name: str, parameters: str) -> None:
         ) from None
 
 
-def call_user(function: Callable[..., Any], *args: Any, **options: Any) -> Any:
+def call_user(function: Callable[..., R], *args: object, **options: object) -> R:
     """Call a function that the user may have written, inside which arguments are checked again.
 
     A function of the library is trusted, and skips its checks.
@@ -245,7 +254,7 @@ def call_user(function: Callable[..., Any], *args: Any, **options: Any) -> Any:
     2
     """
     # A partial has no module; its innermost function does.
-    unwrapped = function
+    unwrapped: Callable[..., object] = function
     while isinstance(unwrapped, partial):
         unwrapped = unwrapped.func
     module = getattr(unwrapped, "__module__", None) or ""

@@ -7,7 +7,8 @@ there is one. Which comparisons have been made is recorded here, so that the own
 from __future__ import annotations
 
 import weakref
-from typing import Any
+
+from .frozen import FrozenModel
 
 __all__ = ["is_first_use", "mark_checked", "needs_check"]
 
@@ -15,7 +16,7 @@ __all__ = ["is_first_use", "mark_checked", "needs_check"]
 _CHECKED: dict[int, set[str]] = {}
 
 
-def needs_check(owner: Any, check: str) -> bool:
+def needs_check(owner: object, check: str) -> bool:
     """Whether a check of an owner's functions has not been made yet.
 
     Parameters
@@ -38,7 +39,7 @@ def needs_check(owner: Any, check: str) -> bool:
     return check not in _CHECKED.get(id(owner), ())
 
 
-def mark_checked(owner: Any, check: str) -> None:
+def mark_checked(owner: object, check: str) -> None:
     """Record that a check of an owner's functions has been made."""
     key = id(owner)
     if key not in _CHECKED:
@@ -49,7 +50,7 @@ def mark_checked(owner: Any, check: str) -> None:
     _CHECKED[key].add(check)
 
 
-def is_first_use(owner: Any, function: str) -> bool:
+def is_first_use(owner: FrozenModel, function: str) -> bool:
     """Whether one of an owner's functions is used for the first time; true once.
 
     Never of an owner that the library constructed without validation: its functions are trusted.

@@ -50,7 +50,7 @@ class FrozenModel:
         vars(self).update(values, is_validated=True)
 
     @classmethod
-    def construct(cls, *args: Any, **options: Any) -> Self:
+    def construct(cls, *args: object, **options: object) -> Self:
         """Build an instance of values that the library made: nothing is checked or copied."""
         # Past __init__, and so past the checks.
         instance = object.__new__(cls)
@@ -63,7 +63,7 @@ class FrozenModel:
                 values[name] = factory()
         return instance
 
-    def replace(self, **changes: Any) -> Self:
+    def replace(self, **changes: object) -> Self:
         """Return a copy with other values in some fields, unchecked."""
         cls: Any = type(self)
         names, _ = _fields(cls)
@@ -74,7 +74,7 @@ class FrozenModel:
 @cache
 def _fields(
     cls: Any,
-) -> tuple[tuple[str, ...], tuple[tuple[str, Callable[[], Any]], ...]]:
+) -> tuple[tuple[str, ...], tuple[tuple[str, Callable[[], object]], ...]]:
     """Return the names of a dataclass's fields, and the factories of defaults by name.
 
     A default that is no factory is an attribute of the class, so that instances need none.
@@ -104,7 +104,7 @@ def field_constraints(cls: Any) -> dict[str, ArgumentConstraint]:
     return sort_arrays_last(constraints)
 
 
-def _freeze(value: Any) -> Any:
+def _freeze(value: object) -> object:
     """Return a value with read-only copies of the arrays in it."""
     if type(value) is tuple:
         return tuple([_freeze(entry) for entry in value])

@@ -7,7 +7,6 @@ import inspect
 import sys
 from collections.abc import Mapping
 from functools import cache
-from typing import Any
 
 from .annotations import ArgumentConstraint, make_constraint
 
@@ -15,7 +14,10 @@ __all__ = ["make_constraints"]
 
 
 def make_constraints(
-    annotations: Mapping[str, Any], module: str, names: Mapping[str, Any], owner: str
+    annotations: Mapping[str, object],
+    module: str,
+    names: Mapping[str, object],
+    owner: str,
 ) -> dict[str, ArgumentConstraint]:
     """Return the constraints that annotations declare, those of arrays last.
 
@@ -60,8 +62,8 @@ def sort_arrays_last(
 
 
 def _evaluate(
-    annotation: str, module: str, names: Mapping[str, Any], argument: str
-) -> Any:
+    annotation: str, module: str, names: Mapping[str, object], argument: str
+) -> object:
     """Evaluate an annotation that is kept as a string."""
     try:
         return eval(annotation, dict(names))
@@ -76,7 +78,7 @@ def _evaluate(
 
 
 @cache
-def _type_checking_imports(module: str) -> dict[str, Any]:
+def _type_checking_imports(module: str) -> dict[str, object]:
     """Import the names that a module imports under ``if TYPE_CHECKING:``."""
     names = dict(vars(sys.modules.get(module, sys)))
     try:

@@ -43,9 +43,7 @@ RULES: dict[str, Callable[..., Any]] = {
     "gossip_consensus": lambda v, c: network.gossip_consensus(
         v, c, rounds=5, rng=np.random.default_rng(0)
     ),
-    "pi_step": lambda v, c: network.pi_step(
-        network.pi_start(v), v, c, dt=0.1, alpha=1.0, a=1.0, b=1.0
-    ),
+    "pi_step": lambda v, c: _two_pi_steps(v, (c, c)),
     "covariance_intersection": lambda v, c: network.covariance_intersection(
         _gaussians(v), c, rounds=2
     ),
@@ -66,6 +64,17 @@ RULES: dict[str, Callable[..., Any]] = {
     "flooding": lambda v, c: network.flooding(v, c),
 }
 """Every rule that does not refuse a graph in parts."""
+
+
+def _two_pi_steps(
+    values: np.ndarray, channels: tuple[Channel, Channel]
+) -> network.PIState:
+    state = network.pi_start(values)
+    for channel in channels:
+        state = network.pi_step(
+            state, values, channel, dt=0.1, alpha=1.0, a=1.0, b=1.0
+        )
+    return state
 
 
 def _gaussians(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -230,6 +239,24 @@ def test_a_single_round_says_nothing_since_graphs_change() -> None:
         network.average_consensus(values, parts)
         network.covariance_intersection(_gaussians(values), parts)
         network.mean_pull(_ensembles(values), parts, gain=0.1)
+
+
+def test_steps_on_graphs_that_change_say_nothing_on_a_fixed_one_they_do() -> None:
+    """Two graphs in parts, used in turn, lead every agent of a path to one average."""
+    values = np.array([[0.0], [3.0], [1.0], [8.0]])
+    pairs = [Graph.from_edges(4, [(0, 1), (2, 3)]), Graph.from_edges(4, [(1, 2)])]
+    state = network.pi_start(values)
+    with warnings.catch_warnings(action="error"):
+        for k in range(500):
+            channel = Channel(pairs[k % 2])
+            state = network.pi_step(
+                state, values, channel, dt=0.1, alpha=0.1, a=2.0, b=1.0
+            )
+    # (0 + 3 + 1 + 8) / 4 = 3; the averages of the first graph's parts are 1.5 and 4.5.
+    assert np.abs(state.estimate - 3.0).max() < 0.15
+    # New channels do not make a graph another one.
+    with pytest.warns(Disconnected, match="got 2 components"):
+        _two_pi_steps(values, (Channel(pairs[0]), Channel(pairs[0])))
 
 
 # --- labels and directions --------------------------------------------------------------------
