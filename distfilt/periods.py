@@ -9,7 +9,7 @@ move numbers by whole periods and change nothing else; those on the branch keep 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -45,10 +45,12 @@ Periods = tuple[float | None, ...]
 """A period for each component, None for one that is not circular; () if none is."""
 
 if TYPE_CHECKING:
-    PeriodsArgument = Sequence[float | None] | Mapping[Any, float | None]
+    PeriodsArgument = (
+        Sequence[float | None] | Mapping[int, float | None] | Mapping[str, float | None]
+    )
 else:
     # Checked by `read_periods`, which converts it.
-    PeriodsArgument = Any
+    PeriodsArgument = object
 
 # A function is linear up to wraps if it differs from its tangent by less, relative to its range.
 _LINEAR = 1e-5
@@ -56,7 +58,7 @@ _LINEAR = 1e-5
 _SAME = 1e-4
 
 
-def read_periods(periods: Any, dim: int, names: Sequence[str] = ()) -> Periods:
+def read_periods(periods: object, dim: int, names: Sequence[str] = ()) -> Periods:
     """Return a period or None for each component, of a sequence or of a mapping.
 
     Parameters
@@ -79,15 +81,16 @@ def read_periods(periods: Any, dim: int, names: Sequence[str] = ()) -> Periods:
     ValueError: periods must have keys among 0, 1, got 2
     """
     if isinstance(periods, Mapping):
-        entries: list[Any] = [None] * dim
-        places = dict(enumerate(range(dim))) | {n: k for k, n in enumerate(names)}
+        entries: list[object] = [None] * dim
+        places: dict[object, int] = dict(enumerate(range(dim)))
+        places |= {n: k for k, n in enumerate(names)}
         for key, period in periods.items():
             if key not in places:
                 raise ValueError(
                     f"periods must have keys among {', '.join(map(str, places))}, got {key}"
                 )
             entries[places[key]] = period
-    elif isinstance(periods, str) or not np.iterable(periods):
+    elif isinstance(periods, str) or not isinstance(periods, Iterable):
         raise InvalidArgumentError(
             f"periods must be a tuple with {dim} entries, or a mapping of components to "
             f"periods, got {periods!r}"
@@ -100,11 +103,12 @@ def read_periods(periods: Any, dim: int, names: Sequence[str] = ()) -> Periods:
     return result if any(period is not None for period in result) else ()
 
 
-def _read_period(period: Any) -> float | None:
+def _read_period(period: object) -> float | None:
     if period is None:
         return None
-    is_number = np.ndim(period) == 0 and isinstance(period, int | float | np.number)
-    if not is_number or isinstance(period, bool):
+    if isinstance(period, bool) or not isinstance(
+        period, int | float | np.floating | np.integer
+    ):
         raise InvalidArgumentError(f"periods must have numbers or None, got {period!r}")
     if not 0 < period < np.inf:
         raise ValueError(f"periods must be positive and finite, got {period}")

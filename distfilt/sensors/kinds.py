@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Annotated, Literal, TypedDict
+from typing import Annotated, Literal, TypedDict, cast
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -561,7 +561,8 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
         residual_function = partial(_stack_residuals, sensors=sensors)
     elif any(sensor.periods for sensor in sensors):
         for sensor in sensors:
-            periods += tuple(sensor.periods) or (None,) * sensor.dim
+            # A sensor keeps its periods in this form.
+            periods += cast(Periods, sensor.periods) or (None,) * sensor.dim
     # A stack of matrices, if every part has one; otherwise Jacobians are stacked.
     linear = None
     if all(sensor.linear is not None for sensor in sensors):

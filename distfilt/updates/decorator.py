@@ -12,7 +12,8 @@ import math
 from collections.abc import Callable
 from functools import partial
 from inspect import signature
-from typing import Annotated, Any, TypeVar, cast
+from types import EllipsisType
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
@@ -98,17 +99,21 @@ def update(function: F) -> F:
     annotations.update(zip(data, _KINDS, strict=True))
     annotations["rng"] = Rng
 
-    def call_checked(**arguments: Any) -> Array:
-        arrays = {name: arguments[name] for name in data if name in arguments}
+    def call_checked(**arguments: object) -> Array:
+        arrays = {}
+        for name in data:
+            value = arguments.get(name)
+            if isinstance(value, np.ndarray):
+                arrays[name] = value
         # An argument that is left out is the function's own error.
         if len(arrays) == len(data):
             arguments.update(_share_leading_axes(arrays))
         return call_user(function, **arguments)
 
-    checked: Any = validated(function, call=call_checked, annotations=annotations)
+    checked = validated(function, call=call_checked, annotations=annotations)
     # A tag, see `has_tag`: it takes a stack of ensembles in one call.
-    checked.stacks = True
-    return cast(F, checked)
+    vars(checked)["stacks"] = True
+    return checked
 
 
 def _share_leading_axes(arrays: dict[str, Array]) -> dict[str, Array]:
@@ -155,11 +160,10 @@ def wraps_update(wrapped: Update) -> Callable[[F], F]:
     """
 
     def decorate(wrapper: F) -> F:
-        checked: Any = update(wrapper)
-        checked.stacks = has_tag(wrapped, "stacks")
-        checked.accepts_missing = has_tag(wrapped, "accepts_missing")
-        checked.weights_members = has_tag(wrapped, "weights_members")
-        return cast(F, checked)
+        checked = update(wrapper)
+        for tag in ("stacks", "accepts_missing", "weights_members"):
+            vars(checked)[tag] = has_tag(wrapped, tag)
+        return checked
 
     return decorate
 
@@ -296,7 +300,11 @@ def _draw_seed(rng: Rng) -> list[int]:
 
 
 def _stream(
-    rng: Rng, seed: list[int], m: int, lead: tuple[int, ...], rows: Any = ...
+    rng: Rng,
+    seed: list[int],
+    m: int,
+    lead: tuple[int, ...],
+    rows: Indices | EllipsisType = ...,
 ) -> Rng:
     """Return the random stream of updates with m components, for a batch or some of its rows.
 
@@ -309,7 +317,7 @@ def _stream(
     if isinstance(rng, RowGenerator):
         # Rows of rows keep their places in the whole batch.
         return RowGenerator(bits, rng.lead, rng.rows[rows])
-    if rows is ...:
+    if isinstance(rows, EllipsisType):
         return Rng(bits)
     return RowGenerator(bits, lead, rows)
 
@@ -336,7 +344,9 @@ class RowGenerator(Rng):
     True
     """
 
-    def __init__(self, bits: Any, lead: tuple[int, ...], rows: Indices) -> None:
+    def __init__(
+        self, bits: np.random.BitGenerator, lead: tuple[int, ...], rows: Indices
+    ) -> None:
         super().__init__(bits)
         self.lead = lead
         self.rows = rows

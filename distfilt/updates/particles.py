@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from typing import Annotated, Any
+from typing import Annotated, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..coupling.transform import normalize_weights
 from ..linalg import cholesky, factor, log_det, log_sum_exp, solve_lower
@@ -26,6 +26,8 @@ from ..validation import (
 __all__ = ["ParticleCollapse", "effective_size", "jitter", "resample"]
 
 Bandwidth = Annotated[float, Bounds(above=0, at_most=1)]
+
+E = TypeVar("E", bound=np.generic)
 
 
 class ParticleCollapse(RuntimeWarning):
@@ -103,7 +105,7 @@ def _mahalanobis_squared(predicted: Array, observed: Array, noise: Array) -> Arr
     return np.asarray((innovation * whitened).sum(axis=-1))
 
 
-def repeat_by_count(points: Any, counts: Indices) -> Any:
+def repeat_by_count(points: NDArray[E], counts: Indices) -> NDArray[E]:
     """Repeat the rows of points (..., N, d), each as often as its count (..., N), N in all."""
     # Counts sum to N in every ensemble, so the repeated rows of a batch keep their places.
     rows = points.reshape(-1, points.shape[-1])

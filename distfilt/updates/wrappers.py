@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Literal, cast
 
 import numpy as np
 
@@ -57,7 +57,7 @@ def _apply_after(update: Update, change: Callable[[Array], Array]) -> Update:
         observation_places: Array | None = None,
     ) -> Array:
         # Only an update that repredicts takes a function `predict`, and only one by places them.
-        options: dict[str, Any] = {"rng": rng}
+        options: dict[str, object] = {"rng": rng}
         if predict is not None:
             options["predict"] = predict
         if observation_places is not None:
@@ -301,7 +301,7 @@ def with_localization(
     update: Update,
     *,
     places: Annotated[ArrayInput, "d k"],
-    observation_places: Any,
+    observation_places: object,
     radius: PositiveFloat,
     period: Periods | None = None,
 ) -> Update:
@@ -433,13 +433,12 @@ def with_localization(
             distance = np.minimum(distance % periods, -distance % periods)
         return gaspari_cohn(np.linalg.norm(distance, axis=-1) / radius)
 
-    local: Any = _one_by_one(update, find_taper)
-    local.locates = True
-    local.locate = locate
-    return cast(Update, local)
+    local = _one_by_one(update, find_taper)
+    vars(local).update(locates=True, locate=locate)
+    return local
 
 
-def find_locate(update: Any) -> Callable[[Sensor], Array] | None:
+def find_locate(update: Update) -> Callable[[Sensor], Array] | None:
     """Return the function of an update that gives a sensor's places, (sensor.dim, k), if any.
 
     >>> find_locate(print)
@@ -449,7 +448,7 @@ def find_locate(update: Any) -> Callable[[Sensor], Array] | None:
     return locate
 
 
-def _check_periods(period: Any, k: int) -> Array:
+def _check_periods(period: Array | float, k: int) -> Array:
     """Return a positive period for each of k axes, infinity where a coordinate does not return."""
     periods = np.broadcast_to(np.asarray(period, dtype=np.float64), (k,)).copy()
     periods[np.isnan(periods)] = np.inf
@@ -459,7 +458,7 @@ def _check_periods(period: Any, k: int) -> Array:
 
 
 def _make_locate(
-    given: Mapping[Sensor, Any] | Callable[[Sensor], Any], k: int
+    given: Mapping[Sensor, object] | Callable[[Sensor], object], k: int
 ) -> Callable[[Sensor], Array]:
     """Return a function that gives the places (sensor.dim, k) of a sensor's components."""
 
@@ -544,10 +543,9 @@ def _one_by_one(update: Update, find_taper: Taper | None) -> Update:
                 predicted = analysis[..., d:]
         return ensemble
 
-    tagged: Any = update_in_turn
-    tagged.repredicts = True
+    vars(update_in_turn)["repredicts"] = True
     # Every observation keeps its column of the taper, also where others are missing.
-    tagged.accepts_missing = find_taper is not None
+    vars(update_in_turn)["accepts_missing"] = find_taper is not None
     return update_in_turn
 
 
