@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     class _Distribution(Protocol):
         """A frozen distribution, such as scipy's multivariate_normal(mean, cov)."""
 
-        def rvs(self, size: Any = ..., random_state: Any = ...) -> Any: ...
+        def rvs(
+            self, size: int = ..., random_state: np.random.Generator = ...
+        ) -> Array: ...
 
     _OnePrior = (
         tuple[ArrayLike, ArrayLike]
@@ -37,7 +39,7 @@ if TYPE_CHECKING:
     Prior = _OnePrior | Sequence[_OnePrior]
 else:
     # Checked by the functions below, which convert it.
-    Prior = Any
+    Prior = object
 
 __all__ = [
     "Prior",
@@ -49,7 +51,7 @@ __all__ = [
 ]
 
 
-def _is_mean_and_cov(prior: Any) -> bool:
+def _is_mean_and_cov(prior: object) -> TypeGuard[tuple[ArrayLike, ArrayLike]]:
     """Whether a prior is (mean, cov), and not a list of two members."""
     if type(prior) is list:
         for entry in prior:
@@ -99,20 +101,19 @@ def prior_moments(
     return mean, cov
 
 
-def _find_moments(prior: Any, dim: int) -> tuple[Any, Any]:
+def _find_moments(prior: Any, dim: int) -> tuple[ArrayLike, ArrayLike]:
     """Return the mean and covariance of a prior, unchecked."""
     if isinstance(prior, GaussianMixture):
         return prior.moments()
     if hasattr(prior, "rvs"):
         # A scalar distribution of scipy has a variance; either may be a method.
         mean = prior.mean
-        cov = getattr(prior, "cov", None)
+        cov: Any = getattr(prior, "cov", None)
         if cov is None:
             cov = getattr(prior, "var", None)
         return mean() if callable(mean) else mean, cov() if callable(cov) else cov
     if _is_mean_and_cov(prior):
-        mean, cov = prior
-        return mean, cov
+        return prior
     if callable(prior) or np.ndim(prior) != 2:
         kind = "a function" if callable(prior) else type(prior).__name__
         raise ValueError(
@@ -158,7 +159,7 @@ def draw_members(
     return np.broadcast_to(ensemble, shape).copy()
 
 
-def split_by_agent(prior: Any, dim: int, n_agents: int) -> list[Any] | None:
+def split_by_agent(prior: Prior, dim: int, n_agents: int) -> list[_OnePrior] | None:
     """Return the priors of a list with one for each agent; None if the prior is one for all.
 
     A list of priors has ``(mean, cov)`` tuples, distributions, mixtures, functions or arrays of
@@ -195,7 +196,7 @@ def split_by_agent(prior: Any, dim: int, n_agents: int) -> list[Any] | None:
     return list(prior)
 
 
-def _is_prior(entry: Any, dim: int) -> bool:
+def _is_prior(entry: object, dim: int) -> bool:
     """Whether an entry of a list is a prior by itself, and not a member of one."""
     if isinstance(entry, GaussianMixture) or hasattr(entry, "rvs") or callable(entry):
         return True
@@ -229,7 +230,7 @@ def prior_mixtures(
     >>> [mixture.n_components for mixture in prior_mixtures(([0.0], [[1.0]]), 1, 2)]
     [1, 1]
     """
-    priors: list[Any] = prior if isinstance(prior, list) else [prior] * n_agents
+    priors = prior if isinstance(prior, list) else [prior] * n_agents
     if len(priors) != n_agents:
         raise ValueError(
             f"prior must be one for all or for each of {n_agents}, got {len(priors)}"

@@ -17,7 +17,7 @@ from ..metrics import crps, gaussian_crps
 from ..network import Ledger
 from ..periods import align, warn_of_wrapped_truth
 from ..validation import Array, check_array
-from .states import SensorState, State, stack_states
+from .states import AnyState, SensorState, State, stack_states
 
 if TYPE_CHECKING:
     import xarray
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     Truth = ArrayLike | Mapping[str, ArrayLike] | None
 else:
     # Checked by `_read_truth`, which converts it; a table of pandas serves as a mapping.
-    Truth = Any
+    Truth = object
 
 __all__ = ["SCORES", "Score", "Summary", "Truth", "final_state", "record_run"]
 
@@ -40,7 +40,16 @@ _BLOCK_SIZE = 32768
 
 _STEP_FIELDS = ("rejected", "log_likelihood", "nis", "n_observed")
 
-_LEDGER_FIELDS = ("messages", "scalars", "bytes", "lost", "rounds")
+_LEDGER_FIELDS = (
+    "messages",
+    "scalars",
+    "bytes",
+    "lost",
+    "transmissions",
+    "broadcast_scalars",
+    "broadcast_bytes",
+    "rounds",
+)
 
 _MEANING = {
     "mean": ("estimate of the state", "of the component"),
@@ -74,7 +83,7 @@ _MEANING = {
 }
 """Long name and unit of each recorded variable."""
 
-Believed = tuple[Any, Any]
+Believed = tuple[AnyState, AnyState]
 """A state, and the belief about its time that is recorded: with a lag, a later one."""
 
 
@@ -122,19 +131,22 @@ class Summary:
     numbers: Mapping[str, Array] = field(default_factory=dict)
 
 
+Components = list[int] | slice
+
+
 @dataclass(frozen=True, eq=False)
 class _KnownTruth:
     """The truth, (T, *runs, 1 or A, d), and the index of the components that are known."""
 
     values: Array
-    components: Any
+    components: Components
 
 
 def record_run(
-    f: Filter[Any],
+    f: Filter[AnyState],
     times: Array,
-    start: State,
-    believed: Iterable[Believed],
+    start: AnyState,
+    believed: Iterable[Believed[AnyState]],
     truth: Truth,
     scores: Collection[Score],
 ) -> xarray.Dataset:
@@ -189,9 +201,9 @@ def record_run(
 
 
 def _collect_series(
-    f: Filter[Any],
-    start: State,
-    believed: Iterable[Believed],
+    f: Filter[AnyState],
+    start: AnyState,
+    believed: Iterable[Believed[AnyState]],
     known: _KnownTruth | None,
     scores: Collection[Score],
 ) -> tuple[dict[str, Array], list[Ledger], State]:
@@ -218,7 +230,7 @@ def _collect_series(
             unseen = _read_unseen(cast(Any, states), f.n_agents)
             row["unseen"] = unseen[0] if is_single else unseen
         if known is not None:
-            index: Any = first if is_single else slice(first, first + len(block))
+            index = first if is_single else slice(first, first + len(block))
             values = known.values[index]
             if f.periods:
                 # A truth that wraps and one that runs on are the same.
@@ -254,8 +266,8 @@ def _read_unseen(states: Sequence[SensorState], n_agents: int) -> Array:
 
 
 def _read_nothing(
-    f: Filter[Any],
-    start: State,
+    f: Filter[AnyState],
+    start: AnyState,
     known: _KnownTruth | None,
     scores: Collection[Score],
 ) -> dict[str, Array]:
@@ -284,14 +296,14 @@ def _read_summary(summary: Summary) -> dict[str, Array]:
     return row
 
 
-def _blocks(believed: Iterable[Believed], batched: bool) -> Iterator[list[Believed]]:
+def _blocks(
+    believed: Iterable[Believed[AnyState]], batched: bool
+) -> Iterator[list[Believed[AnyState]]]:
     """Yield small states of one shape together, so that one call summarizes them."""
 
-    def shape_of(pair: Believed) -> tuple[int, ...]:
+    def shape_of(pair: Believed[AnyState]) -> tuple[int, ...]:
         # One block for each state if they cannot be stacked.
-        return (
-            cast(tuple[int, ...], pair[1].belief.shape) if batched else (_BLOCK_SIZE,)
-        )
+        return cast(SensorState, pair[1]).belief.shape if batched else (_BLOCK_SIZE,)
 
     for shape, same_shape in groupby(believed, shape_of):
         # A state that is large by itself is a block.
@@ -309,8 +321,9 @@ def _read_truth(
     if truth is None:
         return None
     # A table whose columns are components says itself which is which.
-    if hasattr(truth, "columns") and set(truth.columns) <= set(names):
-        truth = dict(truth)
+    columns = getattr(truth, "columns", None)
+    if columns is not None and set(columns) <= set(names):
+        truth = {name: truth[name] for name in columns}
     if isinstance(truth, Mapping):
         return _read_components(truth, names, shape, n_agents)
     values = check_array(truth, "truth", None, finite=False)
@@ -325,7 +338,7 @@ def _read_truth(
 
 
 def _read_components(
-    truth: Mapping[str, Any],
+    truth: Mapping[str, object],
     names: Sequence[str],
     shape: tuple[int, ...],
     n_agents: int,
@@ -349,7 +362,7 @@ def _read_components(
 
 
 def _score(
-    summary: Summary, truth: Array, components: Any, scores: Collection[Score]
+    summary: Summary, truth: Array, components: Components, scores: Collection[Score]
 ) -> dict[str, Array]:
     """Return the scores of a summary in the components that are known."""
     result: dict[str, Array] = {}
@@ -381,7 +394,7 @@ def _score(
     return result
 
 
-def _known_covariance(summary: Summary, components: Any) -> Array | None:
+def _known_covariance(summary: Summary, components: Components) -> Array | None:
     """Return the covariance of the known components; None if the summary has none."""
     if summary.covariance is not None:
         return summary.covariance[..., components, :][..., components]
@@ -449,7 +462,7 @@ def _count_messages(name: str, ledgers: list[Ledger]) -> dict[str, Any]:
     # The first ledger is that of the state before the run.
     total = np.array([getattr(ledger, name) for ledger in ledgers])
     axes = ("time", "agent")[: total.ndim]
-    unit = "B" if name == "bytes" else "1"
+    unit = "B" if name.endswith("bytes") else "1"
     in_step = {"long_name": f"{name} in this step", "units": unit}
     so_far = {"long_name": f"{name} so far", "units": unit}
     return {

@@ -35,10 +35,10 @@ class Reset(NamedTuple):
 
 
 def read_reset(
-    components: Any,
-    value: Any,
-    cov: Any,
-    agents: Any,
+    components: Sequence[object],
+    value: object,
+    cov: object,
+    agents: Sequence[int] | None,
     names: Sequence[str],
     n_agents: int,
 ) -> Reset:
@@ -65,15 +65,15 @@ def read_reset(
     return Reset(indices, partial(_repeat_value, constant), matrix, chosen)
 
 
-def _read_component(component: Any, names: Sequence[str]) -> int:
+def _read_component(component: object, names: Sequence[str]) -> int:
     """Return the index of a component that is given by its index or its name."""
     if isinstance(component, str) and component in names:
         return list(names).index(component)
-    is_index = isinstance(component, int | np.integer) and not isinstance(
-        component, bool
-    )
-    if is_index and 0 <= component < len(names):
-        return int(component)
+    index = -1
+    if isinstance(component, int | np.integer) and not isinstance(component, bool):
+        index = int(component)
+    if 0 <= index < len(names):
+        return index
     raise ValueError(
         f"components must be names ({', '.join(names)}) or indices below {len(names)}, got "
         f"{component!r}"

@@ -10,13 +10,16 @@ from dataclasses import fields, is_dataclass
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 __all__ = ["load_fields", "save_state"]
 
 T = TypeVar("T")
+NumpyArray: TypeAlias = NDArray[np.generic]
+Json: TypeAlias = "None | bool | int | float | str | list[Json] | dict[str, Json]"
 
 _FORMAT = 7
 """Raised when the names or the meaning of saved fields change."""
@@ -24,7 +27,7 @@ _FORMAT = 7
 _DIGEST_SIZE = 32
 
 
-def save_state(state: Any, path: str | PathLike[str]) -> None:
+def save_state(state: object, path: str | PathLike[str]) -> None:
     """Write a state to one file, which appears whole or not at all.
 
     >>> import tempfile
@@ -35,15 +38,16 @@ def save_state(state: Any, path: str | PathLike[str]) -> None:
     ...     load_fields(State, f"{folder}/state.npz")
     State(t=1, 2 agents)
     """
-    arrays: list[Any] = []
+    arrays: list[NumpyArray] = []
     header = {
         "format": _FORMAT,
         "kind": _class_name(type(state)),
         "state": _encode(state, arrays),
     }
     buffer = io.BytesIO()
-    named: dict[str, Any] = {f"a{k}": array for k, array in enumerate(arrays)}
-    np.savez(buffer, header=np.array(json.dumps(header)), **named)
+    named = {f"a{k}": array for k, array in enumerate(arrays)}
+    named["header"] = np.array(json.dumps(header))
+    np.savez(buffer, allow_pickle=False, **named)
     # The check sum stands behind the content, so that a cut file is found too.
     content = buffer.getvalue()
     # Written beside the file and then renamed, which a file system does at once.
@@ -86,7 +90,7 @@ def _class_name(cls: type) -> str:
     return f"{cls.__module__}:{cls.__qualname__}"
 
 
-def _encode(value: Any, arrays: list[Any]) -> Any:
+def _encode(value: object, arrays: list[NumpyArray]) -> Json:
     """Return a value as JSON; its arrays are appended to `arrays` and stand as their numbers."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
@@ -98,21 +102,23 @@ def _encode(value: Any, arrays: list[Any]) -> Any:
     if isinstance(value, tuple | list):
         return {"tuple": [_encode(item, arrays) for item in value]}
     if isinstance(value, np.random.Generator):
-        bits: Any = value.bit_generator
+        bits = value.bit_generator
+        seeds = cast(np.random.SeedSequence, bits.seed_seq)
         # The state of its seed too, so that generators spawned from it later are the same.
-        parts = (bits.state, bits.seed_seq.state)
+        parts = (bits.state, seeds.state)
         return {"rng": [_encode(part, arrays) for part in parts]}
     if isinstance(value, dict):
         return {"dict": {name: _encode(item, arrays) for name, item in value.items()}}
     if is_dataclass(value) and not isinstance(value, type):
         items = {f.name: getattr(value, f.name) for f in fields(value)}
-        return {**_encode(items, arrays), "of": _class_name(type(value))}
+        encoded = {name: _encode(item, arrays) for name, item in items.items()}
+        return {"dict": encoded, "of": _class_name(type(value))}
     raise ValueError(
         f"state must have fields that can be saved, got {type(value).__name__}"
     )
 
 
-def _decode(encoded: Any, arrays: dict[str, Any]) -> Any:
+def _decode(encoded: Any, arrays: dict[str, NumpyArray]) -> Any:
     """Return the value that :func:`_encode` turned into JSON and arrays."""
     if not isinstance(encoded, dict):
         return encoded
@@ -138,10 +144,10 @@ def _decode_rng(state: Any, seed: Any) -> np.random.Generator:
     return np.random.Generator(bits)
 
 
-def _find_class(name: str) -> Any:
+def _find_class(name: str) -> type:
     """Find a dataclass of this package; a file cannot name anything else to be imported."""
     module, _, qualname = name.partition(":")
-    cls: Any = None
+    cls: object = None
     if module.startswith("distfilt."):
         cls = getattr(import_module(module), qualname)
     if not (isinstance(cls, type) and is_dataclass(cls)):

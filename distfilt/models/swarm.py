@@ -8,7 +8,6 @@ from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..validation import (
     Array,
