@@ -144,6 +144,11 @@ class Filter(FrozenModel, ABC, Generic[S]):
         return False
 
     @cached_property
+    def hops(self) -> int | Literal["all"]:
+        """Over how many links observations travel."""
+        return 1
+
+    @cached_property
     def lag(self) -> int:
         """How many earlier times a state keeps."""
         return 0
@@ -336,7 +341,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         has_sensors = hasattr(self, "agent_sensors")
         # Mostly each agent has one observation, of a new time: then none has come before.
         is_plain = not matched and t > state.t
-        if has_sensors and (not is_plain or any(len(entries) > 1 for entries in read)):
+        if has_sensors and (not is_plain or max(map(len, read)) > 1):
             read, matched, repeated = drop_repeated(
                 read, matched, state.assimilated, cast(Any, self).model.dim
             )
@@ -362,7 +367,8 @@ class Filter(FrozenModel, ABC, Generic[S]):
         self, step: Step[S], observations: Sequence[Observation]
     ) -> None:
         """Warn once of angles in degrees, in observations that are not part of a plan."""
-        text = find_degrees(self, observations)
+        sensors: Sequence[Sequence[Sensor]] = getattr(self, "agent_sensors", ())
+        text = find_degrees(sensors, observations)
         if text is not None:
             step.warn_once("degrees", text)
 

@@ -20,12 +20,14 @@ import numpy as np
 
 from ..linalg import deviations, symmetrise, to_unit_variances
 from ..models import Model
-from ..periods import wrap_differences
+from ..periods import Periods, wrap_differences
 from ..validation import Array, format_number
 from .observations import Observation
 
 if TYPE_CHECKING:
-    from .states import SensorState
+    from .base import Filter
+    from .gaussian import GaussianFilter, GaussianState
+    from .states import AnyState, State
 
 __all__ = ["Bridge", "bridge_states", "insert_times"]
 
@@ -83,7 +85,7 @@ def draw_bridge(
     after: Array,
     times: tuple[float, float, float],
     normal: Array,
-    periods: Any,
+    periods: Periods,
 ) -> Array:
     """Return states (..., N, d) at the second of three times, from those of the others.
 
@@ -100,13 +102,13 @@ def draw_bridge(
 
 
 def insert_times(
-    f: Any,
+    f: Filter[AnyState],
     delayed: Sequence[Observation],
-    state: Any,
+    state: AnyState,
     t: float,
     *,
     reuse_rng: bool,
-) -> Any:
+) -> AnyState:
     """Return the state with beliefs about the times of delayed observations that it does not keep.
 
     A time within the step that is taken is inserted behind its forecast, so that the state
@@ -132,8 +134,13 @@ def _is_kept(t_obs: float, times: Sequence[float], t: float) -> bool:
 
 
 def _forecast(
-    f: Any, state: SensorState, t: float, t_obs: float, *, reuse_rng: bool
-) -> Any:
+    f: Filter[AnyState],
+    state: AnyState,
+    t: float,
+    t_obs: float,
+    *,
+    reuse_rng: bool,
+) -> AnyState:
     """Return the forecast at `t`, without an exchange."""
     if t_obs >= t:
         return state
@@ -146,14 +153,16 @@ def _forecast(
     return quiet._advance(state, t, [None] * f.n_agents, (), reuse_rng=reuse_rng)
 
 
-def split_history(state: Any, t_obs: float) -> tuple[int, float, float]:
+def split_history(state: State, t_obs: float) -> tuple[int, float, float]:
     """Return how many kept times are before `t_obs`, and the times on both of its sides."""
     times = (*state.times, state.t)
     place = sum(time < t_obs for time in times)
     return place, times[place - 1], times[place]
 
 
-def insert_gaussian(f: Any, state: Any, t_obs: float) -> Any:
+def insert_gaussian(
+    f: GaussianFilter, state: GaussianState, t_obs: float
+) -> GaussianState:
     """Return a Gaussian state with the belief about a time between two that it keeps."""
     place, start, end = split_history(state, t_obs)
     d = state.dim

@@ -191,7 +191,7 @@ class EnsembleFilter(
     ----------
     model, sensors, graph, gate_probability, faults, names
         As for :class:`~distfilt.filters.SensorFilter`.
-    fusion, share_observations, lag, on_error, exchange_interval, record_evidence
+    fusion, share_observations, hops, lag, on_error, exchange_interval, record_evidence
         As in :mod:`distfilt.filters.options`. The rule is a function
         ``fusion(ensembles, channel) -> ensembles``, such as ``partial(mean_pull, gain=0.05)``.
     update : callable

@@ -14,6 +14,7 @@ import numpy as np
 from ..network import Channel
 from ..sensors import Sensor
 from ..validation import Array, call_user, check_array, format_number
+from .flooding import flood_observations
 from .observations import Observation, sensor_of
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ Known = dict[float, list[list[tuple[Sensor, Array]]]]
 def collect_observations(step: Step[Any]) -> Known:
     """Share the step's observations, and sort by time those that each agent has then.
 
-    An agent has its own observations and those that its neighbours sent, ordered by sender.
+    An agent has its own observations and those that others sent, ordered by their agents.
     """
     observed = [list(of_agent) for of_agent in step.observations]
     # Delayed observations carry their own time, and are sorted with the others below.
@@ -37,7 +38,9 @@ def collect_observations(step: Step[Any]) -> Known:
         observed[observation.agent].append(observation)
     sent = _choose_outgoing(step, observed)
     inbox: list[dict[int, Any]] = [{} for _ in observed]
-    if sent:
+    if sent and step.filter.hops != 1:
+        inbox = _flood(step, sent)
+    elif sent:
         payloads = [_pack(step, of_agent) for of_agent in sent]
         inbox = step.channel.broadcast(payloads)
     own_labels = [_label(step, of_agent) for of_agent in observed]
@@ -132,17 +135,43 @@ def _pack(step: Step[Any], observations: list[Observation]) -> Any:
     """
     if not observations:
         return None
+    numbers = _describe(step, observations)
+    if not numbers:
+        return observations[0].value
+    # The same labels in all runs.
+    labels = np.broadcast_to(np.array(numbers), (*step.runs, len(numbers)))
+    return (*[observation.value for observation in observations], labels)
+
+
+def _describe(step: Step[Any], observations: list[Observation]) -> list[float]:
+    """Return the numbers that travel with observations: time, sensor and metadata of each.
+
+    One present observation of the agent's first sensor needs none.
+    """
     numbers: list[float] = []
     for observation in observations:
         # A sensor of the observation's own has no number; its metadata describe it.
         number = observation.sensor if isinstance(observation.sensor, int) else -1
         numbers += [observation.t, number, *observation.metadata]
     # Time and sensor go without saying: now, and the first one.
-    if len(observations) == 1 and numbers in ([step.t, 0], [step.t, -1]):
-        return observations[0].value
-    # The same labels in all runs.
-    labels = np.broadcast_to(np.array(numbers), (*step.runs, len(numbers)))
-    return (*[observation.value for observation in observations], labels)
+    is_plain = len(observations) == 1 and numbers in ([step.t, 0], [step.t, -1])
+    return [] if is_plain else numbers
+
+
+def _flood(step: Step[Any], sent: list[list[Observation]]) -> list[dict[int, Any]]:
+    """Send observations over several links; the values that each agent receives, by their agent.
+
+    The number of the agent that made them travels with them.
+    """
+    bundles: list[tuple[Array, ...] | None] = []
+    labels = []
+    for agent, observations in enumerate(sent):
+        values = tuple([observation.value for observation in observations])
+        bundles.append(values or None)
+        labels.append(np.array([agent, *_describe(step, observations)], dtype=float))
+    hops = step.filter.hops
+    limit = None if hops == "all" else hops
+    return flood_observations(step.channel, bundles, labels, limit)
 
 
 def _label(

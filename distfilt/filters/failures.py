@@ -61,7 +61,7 @@ class FilterError(RuntimeError):
         agent_text = "" if agent is None else f"agent {agent}, "
         super().__init__(f"{run_text}{agent_text}t = {format_number(t)} s: {why}")
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[type[FilterError], tuple[object, ...]]:
         return FilterError, (self.run, self.agent, self.t, self.why)
 
 

@@ -133,7 +133,7 @@ class GaussianFilter(
     ----------
     model, sensors, graph, gate_probability, faults, names
         As for :class:`~distfilt.filters.SensorFilter`.
-    fusion, share_observations, lag, on_error, exchange_interval, record_evidence
+    fusion, share_observations, hops, lag, on_error, exchange_interval, record_evidence
         As in :mod:`distfilt.filters.options`. The rule is a function
         ``fusion((means, covs), channel) -> (means, covs)``, such as
         :func:`distfilt.network.covariance_intersection`.
@@ -202,7 +202,7 @@ class GaussianFilter(
 
     def insert_time(self, state: GaussianState, t: float) -> GaussianState:
         """Return the state with a belief about a time between two that it keeps."""
-        return cast(GaussianState, insert_gaussian(self, state, t))
+        return insert_gaussian(self, state, t)
 
     def next_state(self, step: Step[GaussianState]) -> GaussianState:
         """Forecast, condition on the received observations, fuse.
@@ -380,7 +380,7 @@ class GaussianFilter(
             slope = joint_slope
         # r = y* - h(m); NaN where a component is missing, which `condition` leaves out.
         innovation = group.target - predicted
-        arrays = (joint_mean, joint_cov, innovation, slope)
+        arrays: tuple[Array, ...] = (joint_mean, joint_cov, innovation, slope)
         if extra is not None:
             # S = H P Hᵀ + R, where the extra covariance of the unscented points counts as noise.
             arrays = (*arrays, group.noise + extra)

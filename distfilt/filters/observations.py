@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, TypeGuard
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..sensors import Sensor
 from ..validation import (
@@ -22,7 +23,7 @@ from ..validation import (
 
 if TYPE_CHECKING:
     from .base import SensorFilter
-    from .states import State
+    from .states import AnyState, State
 
 __all__ = [
     "Observation",
@@ -69,7 +70,7 @@ class Observation(FrozenModel):
     arrival_time: float | None = None
 
 
-def sensor_of(f: SensorFilter[Any], observation: Observation) -> Sensor:
+def sensor_of(f: SensorFilter[AnyState], observation: Observation) -> Sensor:
     """Return the sensor of an observation: its own, or one of the agent's."""
     if isinstance(observation.sensor, Sensor):
         f.check_likelihood(observation.sensor)
@@ -90,7 +91,7 @@ def sensor_of(f: SensorFilter[Any], observation: Observation) -> Sensor:
 
 
 def read_observations(
-    f: SensorFilter[Any], observations: Any, runs: tuple[int, ...], t: float
+    f: SensorFilter[AnyState], observations: object, runs: tuple[int, ...], t: float
 ) -> list[list[Observation]]:
     """Check the observations of one time, and return a list of them for each agent.
 
@@ -106,7 +107,7 @@ def read_observations(
         name = f"observations[{agent}]"
         # None, one value, one Observation, or a list of Observations.
         if entry is None:
-            entries: Sequence[Any] = ()
+            entries: Sequence[object] = ()
         else:
             entries = entry if are_observations(entry) else (entry,)
         checked = []
@@ -119,7 +120,9 @@ def read_observations(
     return result
 
 
-def list_by_agent(observations: Any, n_agents: int) -> Any:
+def list_by_agent(
+    observations: object, n_agents: int
+) -> Sequence[object] | NDArray[np.generic]:
     """Return observations as a list or an array with one entry for each agent.
 
     >>> list_by_agent([1.0, 2.0], 3)
@@ -127,8 +130,9 @@ def list_by_agent(observations: Any, n_agents: int) -> Any:
     ValueError: observations must be a list with an entry for each of 3 agents, got 2 entries
     """
     # A table of pandas.
-    if hasattr(observations, "to_numpy"):
-        observations = observations.to_numpy()
+    to_numpy = getattr(observations, "to_numpy", None)
+    if to_numpy is not None:
+        observations = to_numpy()
     if not isinstance(observations, Sequence | np.ndarray):
         raise InvalidArgumentError(
             f"observations must be a list with an entry for each of {n_agents} agents, "
@@ -142,7 +146,7 @@ def list_by_agent(observations: Any, n_agents: int) -> Any:
     return observations
 
 
-def are_observations(entries: Any) -> bool:
+def are_observations(entries: object) -> TypeGuard[Sequence[Observation]]:
     """Whether the entries of a list are Observations, and nothing else."""
     if not isinstance(entries, list | tuple):
         return False
@@ -150,7 +154,7 @@ def are_observations(entries: Any) -> bool:
 
 
 def _check_entry(
-    f: SensorFilter[Any], entry: Any, agent: int, t: float, name: str
+    f: SensorFilter[AnyState], entry: object, agent: int, t: float, name: str
 ) -> Observation:
     """Return an Observation of this agent and time, or make one of its only sensor's value."""
     if not isinstance(entry, Observation):
@@ -176,7 +180,10 @@ def _check_entry(
 
 
 def _complete(
-    f: SensorFilter[Any], observation: Observation, runs: tuple[int, ...], name: str
+    f: SensorFilter[AnyState],
+    observation: Observation,
+    runs: tuple[int, ...],
+    name: str,
 ) -> Observation | None:
     """Return an observation with a value for each run, or None if all of it is missing."""
     value = observation.value
@@ -195,7 +202,7 @@ def _complete(
 
 
 def match_delayed(
-    f: SensorFilter[Any], delayed: Sequence[Observation], state: State, t: float
+    f: SensorFilter[AnyState], delayed: Sequence[Observation], state: State, t: float
 ) -> list[Observation]:
     """Match delayed observations to the stored time that each belongs to.
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 from ..validation import (
     NonNegativeInt,
     PositiveFloat,
+    PositiveInt,
     validated,
 )
 from .base import Filter
@@ -48,21 +49,44 @@ class FusesBeliefs(Filter[S]):
     """
 
     _: KW_ONLY
-    fusion: Callable[..., Any] | None = None
+    fusion: Callable[..., object] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class SharesObservations(Filter[S]):
-    """A filter whose agents can send their observations to their neighbours.
+    """A filter whose agents can send their observations to other agents.
 
     Parameters
     ----------
     share_observations : bool
-        Whether they do; the neighbours assimilate them too.
+        Whether they do; the receivers assimilate them too.
+    hops : int or "all"
+        Over how many links an observation travels: 1 for the neighbours; more if agents forward
+        it in the same step, each once and never back to a neighbour from which it came; "all"
+        until all agents of a connected graph have it. The number of the agent that made it is
+        sent too, unless `hops` is 1.
+
+    Examples
+    --------
+    Kalman filters that flood their observations are one filter of all of them:
+
+    >>> import numpy as np
+    >>> from distfilt.filters import GaussianFilter
+    >>> from distfilt.models import Model
+    >>> from distfilt.network import graphs
+    >>> from distfilt.sensors import component
+    >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    >>> f = GaussianFilter(
+    ...     still, [component([0], std=1.0)] * 4, graphs.path(4), hops="all"
+    ... )
+    >>> state = f.step(f.start(([0.0], [[1.0]])), 0.0, [[1.0], [2.0], [3.0], [4.0]])
+    >>> state.means.ravel().round(6), state.ledger.scalars
+    (array([2., 2., 2., 2.]), array([ 2, 10, 10,  2]))
     """
 
     _: KW_ONLY
     share_observations: bool = True
+    hops: PositiveInt | Literal["all"] = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +176,7 @@ class KeepsPast(Filter[S]):
         self,
         state: S,
         times: TimesArgument,
-        observations: Any,
+        observations: object,
         *,
         truth: Truth = None,
         scores: Collection[Score] = SCORES,

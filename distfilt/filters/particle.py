@@ -83,7 +83,7 @@ class ParticleFilter(
     ----------
     model, sensors, graph, gate_probability, faults, names
         As for :class:`~distfilt.filters.SensorFilter`.
-    fusion, share_observations, lag, on_error, exchange_interval, record_evidence
+    fusion, share_observations, hops, lag, on_error, exchange_interval, record_evidence
         As in :mod:`distfilt.filters.options`. The rule is one of ensembles; agents resample
         before it.
     members : int
@@ -294,6 +294,12 @@ class ParticleFilter(
             return log_weights, ancestors, np.inf
         is_few = is_due & self._has_few_ancestors(ancestors)
         is_few[state.failed] = False
+        if noise is None and not np.count_nonzero(is_few):
+            # The usual case: no copies to separate, no families to look into.
+            self._select(
+                stack, log_weights, state.weights, is_due, offset, ancestors
+            )
+            return log_weights, ancestors, np.inf
         least = max(_FEWEST, 0.02 * self.members)
         sizes, shares = measure_families(
             before, state.weights, ancestors, is_few, least
@@ -382,8 +388,8 @@ class ParticleFilter(
                 stack[k][rows] = taken
             else:
                 stack[k] = taken
-        labels = particles.repeat_by_count(ancestors[rows][..., None], counts)
-        ancestors[rows] = labels[..., 0]
+        labels = np.repeat(ancestors[rows].reshape(-1), counts.reshape(-1))
+        ancestors[rows] = labels.reshape(counts.shape)
         # After resampling every particle has the weight 1/N.
         log_weights[rows] = -np.log(self.members)
         return counts
@@ -452,6 +458,7 @@ class ParticleFilter(
         return bound
 
 
+_TINY = np.finfo(float).tiny
 _FEWEST = 10.0
 """Copies are jittered if the particles are worth fewer independent ones, or a fiftieth of them;
 below half of this number, a warning is given."""
@@ -460,8 +467,9 @@ below half of this number, a warning is given."""
 def find_ancestors(state: ParticleState) -> Indices:
     """Return the ancestors of a state's particles, a copy; by default each is its own."""
     shape = state.log_weights.shape
-    if np.shape(state.ancestors) == shape:
-        return np.array(state.ancestors, dtype=np.intp)
+    ancestors: Indices | None = state.ancestors
+    if ancestors is not None and ancestors.shape == shape:
+        return ancestors.copy()
     return np.broadcast_to(np.arange(shape[-1]), shape).copy()
 
 
@@ -488,12 +496,14 @@ def measure_families(
     """
     sizes = np.full(agents.shape, np.inf)
     shares = np.ones(agents.shape)
-    for index in map(tuple, np.argwhere(agents)):
+    for index in zip(*np.nonzero(agents), strict=True):
         x = points[index]
         w = weights[index][:, None]
         labels = ancestors[index]
-        starts = np.flatnonzero(np.diff(labels, prepend=labels[0] - 1))
-        counts = np.diff(starts, append=labels.size)
+        # Descendants of one ancestor stand together.
+        is_start = np.ones(labels.size, dtype=bool)
+        np.not_equal(labels[1:], labels[:-1], out=is_start[1:])
+        starts = np.flatnonzero(is_start)
         mass = np.add.reduceat(w, starts)
         n_families = 1 / (mass**2).sum()
         if n_families >= least:
@@ -501,9 +511,11 @@ def measure_families(
             shares[index] = 0.0
             continue
         # Means of the families, at each of their members.
-        positive = np.maximum(mass, np.finfo(float).tiny)
-        means = np.repeat(np.add.reduceat(w * x, starts) / positive, counts, axis=0)
-        mean = (w * x).sum(axis=0)
+        weighted = w * x
+        positive = np.maximum(mass, _TINY)
+        means = np.add.reduceat(weighted, starts) / positive
+        means = means[is_start.cumsum() - 1]
+        mean = weighted.sum(axis=0)
         within = (w * (x - means) ** 2).sum(axis=0)
         total = (w * (x - mean) ** 2).sum(axis=0)
         # A component that is known has no variance but rounding.

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..periods import Periods
 from ..sensors import Sensor
@@ -17,19 +17,25 @@ from .observations import Observation, are_observations, list_by_agent
 
 if TYPE_CHECKING:
     from .base import Filter
-    from .states import State
+    from .states import AnyState
 
     TimesArgument = ArrayLike | None
 else:
     # Checked by `plan_steps`, which converts it.
-    TimesArgument = Any
+    TimesArgument = object
 
 __all__ = ["TimesArgument", "find_degrees", "plan_steps"]
 
 
+SensorLists = Sequence[Sequence[Sensor]]
+"""The sensors of each agent."""
+Series = Sequence[object] | NDArray[np.generic]
+"""The observations of an agent, one entry for each time."""
+
+
 def plan_steps(
-    f: Filter[Any], state: State, times: TimesArgument, observations: Any
-) -> tuple[Array, Iterator[Any]]:
+    f: Filter[AnyState], state: AnyState, times: TimesArgument, observations: object
+) -> tuple[Array, Iterator[Sequence[object]]]:
     """Return the times of a run's steps, and an iterator over the observations of each.
 
     >>> from distfilt.filters import GaussianFilter
@@ -68,8 +74,8 @@ def plan_steps(
 
 
 def _plan_events(
-    f: Filter[Any], grid: Array, events: Sequence[Observation]
-) -> tuple[Array, Iterator[Any]]:
+    f: Filter[AnyState], grid: Array, events: Sequence[Observation]
+) -> tuple[Array, Iterator[Sequence[object]]]:
     """Sort events by time; there is a step at each time of the grid and of an event."""
     by_time: dict[float, list[list[Observation]]] = {}
     for t in grid:
@@ -83,25 +89,25 @@ def _plan_events(
         if event.t not in by_time:
             by_time[event.t] = [[] for _ in range(f.n_agents)]
         by_time[event.t][event.agent].append(event)
-    if hasattr(f, "agent_sensors"):
-        wild = find_degrees(f, events)
-        if wild is not None:
-            warnings.warn(wild, RuntimeWarning, stacklevel=5)
+    wild = find_degrees(_sensors_of(f), events)
+    if wild is not None:
+        warnings.warn(wild, RuntimeWarning, stacklevel=5)
     times = np.array(sorted(by_time))
     return times, iter([by_time[t] for t in times])
 
 
-def _plan_series(f: Filter[Any], grid: Array, observations: Any) -> Iterator[Any]:
+def _plan_series(
+    f: Filter[AnyState], grid: Array, observations: object
+) -> Iterator[Sequence[object]]:
     """Take each agent's series (T, ...) apart into times."""
-    series_by_agent: list[Any] = []
+    series_by_agent: list[Series | None] = []
     for series in list_by_agent(observations, f.n_agents):
         if series is None or isinstance(series, list | tuple):
             series_by_agent.append(series)
         else:
             # A table with named columns would give a column where a row is asked for.
-            series_by_agent.append(np.atleast_1d(series))
-    # A filter of positions has a number of agents in place of sensors.
-    sensors: Sequence[Sequence[Sensor]] = getattr(f, "agent_sensors", ())
+            series_by_agent.append(np.atleast_1d(np.asarray(series)))
+    sensors = _sensors_of(f)
     for agent, series in enumerate(series_by_agent):
         if series is not None and len(series) != grid.size:
             raise ValueError(
@@ -111,11 +117,17 @@ def _plan_series(f: Filter[Any], grid: Array, observations: Any) -> Iterator[Any
         if isinstance(series, np.ndarray) and sensors:
             _check_series(sensors[agent], series, agent)
         if series is not None and sensors:
-            _warn_of_degrees(f, sensors[agent], series, agent)
+            _warn_of_degrees(sensors, series, agent)
     return (
         [None if series is None else series[k] for series in series_by_agent]
         for k in range(grid.size)
     )
+
+
+def _sensors_of(f: Filter[AnyState]) -> SensorLists:
+    """Return the agents' sensors; a filter of positions has a number of agents in their place."""
+    sensors: SensorLists = getattr(f, "agent_sensors", ())
+    return sensors
 
 
 def _check_series(sensors: Sequence[Sensor], series: Array, agent: int) -> None:
@@ -128,10 +140,9 @@ def _check_series(sensors: Sequence[Sensor], series: Array, agent: int) -> None:
         )
 
 
-def _warn_of_degrees(
-    f: Filter[Any], sensors: Sequence[Sensor], series: Any, agent: int
-) -> None:
+def _warn_of_degrees(agent_sensors: SensorLists, series: Series, agent: int) -> None:
     """Warn if a series of arrays, or of Observations, has angles in degrees."""
+    sensors = agent_sensors[agent]
     entries: list[Observation] = []
     if isinstance(series, np.ndarray) and series.dtype.kind in "fiu":
         # All values of the only sensor at once.
@@ -140,13 +151,13 @@ def _warn_of_degrees(
             entries = [Observation.construct(0.0, agent, values)]
     elif any(sensor.wraps for sensor in sensors):
         entries = _list_entries(sensors, series, agent)
-    text = find_degrees(f, entries)
+    text = find_degrees(agent_sensors, entries)
     if text is not None:
         warnings.warn(text, RuntimeWarning, stacklevel=5)
 
 
 def _list_entries(
-    sensors: Sequence[Sensor], series: Any, agent: int
+    sensors: Sequence[Sensor], series: Series, agent: int
 ) -> list[Observation]:
     """Return the entries of a list of times as Observations; what fits no sensor is left out."""
     result: list[Observation] = []
@@ -161,7 +172,9 @@ def _list_entries(
     return result
 
 
-def find_degrees(f: Any, observations: Sequence[Observation]) -> str | None:
+def find_degrees(
+    agent_sensors: SensorLists, observations: Sequence[Observation]
+) -> str | None:
     """Return a warning if angles are more than four turns away from their wrapped values.
 
     Observations are looked at together for each agent and sensor.
@@ -170,17 +183,17 @@ def find_degrees(f: Any, observations: Sequence[Observation]) -> str | None:
     >>> from distfilt.models import constant_velocity
     >>> from distfilt.sensors import bearing
     >>> f = GaussianFilter(constant_velocity(sigma=1.0), [bearing([0, 1], std=0.1)])
-    >>> find_degrees(f, [Observation(0.0, 0, [53.13])])
+    >>> find_degrees(f.agent_sensors, [Observation(0.0, 0, [53.13])])
     "observations[0] must be angles in rad, got some 8 turns off by a sensor of kind ..."
-    >>> find_degrees(f, [Observation(0.0, 0, [-3.1])])
+    >>> find_degrees(f.agent_sensors, [Observation(0.0, 0, [-3.1])])
     """
     values: dict[tuple[int, Sensor], list[Array]] = {}
     for observation in observations:
-        if observation.agent >= f.n_agents:
+        if observation.agent >= len(agent_sensors):
             continue  # refused later, by its name
         sensor = observation.sensor
         if not isinstance(sensor, Sensor):
-            sensors = f.agent_sensors[observation.agent]
+            sensors = agent_sensors[observation.agent]
             if sensor >= len(sensors):
                 continue
             sensor = sensors[sensor]

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Hashable, Iterable, Sequence
 
 import numpy as np
 
 from ..sensors import Sensor
+from ..validation import Array
 from .observations import Observation
 
 __all__ = ["Assimilated", "drop_repeated"]
 
-Assimilated = tuple[float, int, Any, Any, tuple[float, ...]]
+Assimilated = tuple[float, int, int | Sensor, Array, tuple[float, ...]]
 """Time, agent, sensor (its number, or itself), value and metadata of an observation."""
 
 
@@ -48,7 +48,7 @@ def drop_repeated(
     ([2.0, 2.5], 1)
     """
     # Candidates by time, agent and value; sensors are compared only where these agree.
-    known: dict[Any, list[tuple[Any, tuple[float, ...]]]] = {}
+    known: dict[Hashable, list[tuple[int | Sensor, tuple[float, ...]]]] = {}
     for t, agent, sensor, value, metadata in assimilated:
         key = t, agent, _fingerprint(value)
         known.setdefault(key, []).append((sensor, metadata))
@@ -69,12 +69,15 @@ def drop_repeated(
     return kept, keep_new(delayed), repeated
 
 
-def _fingerprint(value: Any) -> tuple[tuple[int, ...], bytes]:
+def _fingerprint(value: Array) -> tuple[tuple[int, ...], bytes]:
     return value.shape, value.tobytes()
 
 
 def _is_same(
-    observation: Observation, sensor: Any, metadata: tuple[float, ...], dim: int
+    observation: Observation,
+    sensor: int | Sensor,
+    metadata: tuple[float, ...],
+    dim: int,
 ) -> bool:
     """Whether an observation of an equal value is of the same sensor too."""
     of_observation = observation.sensor

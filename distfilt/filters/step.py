@@ -477,13 +477,8 @@ class Step(Generic[S]):
         """
         state = self.state
         if isinstance(state, SensorState):
-            # A family may keep its past in its own form; otherwise it is (time, belief) pairs.
-            pairs = tuple(zip(self.times, past, strict=False))
-            if "history" not in belief:
-                history = [pair for pair in pairs if pair[0] in self.lagged]
-                belief["history"] = tuple(history)
-            if self.references is not None:
-                belief |= self._describe_changes(pairs, self.references)
+            if self.times or self.references is not None:
+                belief |= self._describe_past(past, belief)
             belief["unseen"] = self.unseen
             belief["failed"] = self.failed
             belief["pending"] = self.pending
@@ -500,14 +495,21 @@ class Step(Generic[S]):
         )
         return new
 
-    def _describe_changes(
-        self, past: tuple[tuple[float, Array], ...], references: References
+    def _describe_past(
+        self, past: Iterable[Array], belief: dict[str, Any]
     ) -> dict[str, Any]:
-        """Return the state's fields about sensors of changes, and what they compare with."""
-        kept = [
-            (t, x) for t, x in past if t in references.kept and t not in self.lagged
-        ]
-        return {"last_changes": references.last_changes, "references": tuple(kept)}
+        """Return the state's fields about the earlier times that the lag or a sensor keeps."""
+        pairs = list(zip(self.times, past, strict=False))
+        fields: dict[str, Any] = {}
+        # A family may keep its past in its own form; otherwise it is (time, belief) pairs.
+        if "history" not in belief:
+            fields["history"] = tuple([pair for pair in pairs if pair[0] in self.lagged])
+        if self.references is not None:
+            # Beliefs with which sensors of changes compare, beyond those of the lag.
+            kept = self.references.kept.difference(self.lagged)
+            fields["references"] = tuple([pair for pair in pairs if pair[0] in kept])
+            fields["last_changes"] = self.references.last_changes
+        return fields
 
     def _note_assimilated(self) -> tuple[Assimilated, ...]:
         """Return the observations of the times that are kept, by copies of their values."""
@@ -887,7 +889,7 @@ class Received:
             values[index] = part.sensor.bring_near(ours, aim).swapaxes(-1, -2)
         return predicted
 
-    def jacobian(self, states: Array, cov: Array) -> Array:
+    def jacobian(self, states: Array, cov: Array | None = None) -> Array:
         """Return the derivatives of the observations at states (*runs, G, d), (*runs, G, M, d).
 
         The states have the covariances `cov`, (*runs, G, d, d), which scale differences.
@@ -896,7 +898,9 @@ class Received:
         if self.linear:
             return np.full((*self.target.shape, d), self.H(d))
         std = None
-        if any([needs_differences(part.sensor) for part in self.parts]):
+        if cov is not None and any(
+            [needs_differences(part.sensor) for part in self.parts]
+        ):
             std = deviations(cov)
         if self.has_one_part:
             return self.parts[0].sensor.jacobian(states, std=std)

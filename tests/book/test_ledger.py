@@ -42,6 +42,8 @@ def test_ledger_has_every_item_once() -> None:
         assert not powerless_claims(
             row
         )  # on its null's numbers each rule judges otherwise
+        # A rule that rejects a case in which the claim is true could never hold.
+        assert "(fails too)" not in row["control"]
         # Without a null, no claim has power.
         assert len(claims_of(row)) == len(powerless_claims(row | {"null": ""}))
 
@@ -51,7 +53,7 @@ def test_a_verdict_fills_its_row() -> None:
     assert row["verdict"] == "not yet" and row["chapter"] == ITEM["chapter"]
     (row,) = ledger([ITEM], [VERDICT])
     # Cells that the verdict does not give stay empty.
-    other_cells = {"kind": "results", "null": "", "range": ""}
+    other_cells = {"kind": "results", "null": "", "control": "", "range": ""}
     assert row == VERDICT | other_cells and tuple(row) == COLUMNS
     assert text_of([row]).splitlines()[1].endswith('"a, b"')
 
@@ -62,8 +64,9 @@ def test_a_verdict_fills_its_row() -> None:
         [VERDICT, VERDICT],
         [{**VERDICT, "item": "Fig. 9"}],
         [{**VERDICT, "verdict": "read"}],
+        [{**VERDICT, "item": "Table I", "verdict": "fitted"}],
     ],
-    ids=["twice", "unknown item", "results read"],
+    ids=["twice", "unknown item", "results read", "parameters fitted"],
 )
 def test_ledger_rejects(verdicts: list[dict[str, str]]) -> None:
     with pytest.raises(
@@ -82,5 +85,30 @@ def test_tables_that_are_read_are_not_counted_as_matches() -> None:
     )
     assert counts["results"] == (
         1,
-        {"match": 0, "differs": 1, "not comparable": 0, "not yet": 0},
+        {"match": 0, "differs": 1, "not comparable": 0, "fitted": 0, "not yet": 0},
     )
+
+
+def test_a_fitted_result_is_not_counted_as_a_match() -> None:
+    # Numbers that our input was chosen to give show nothing about the paper's.
+    fitted = {**VERDICT, "verdict": "fitted", "why": "14 numbers fitted to 9"}
+    _, counts = summaries(ledger([ITEM], [fitted]))["results"]
+    assert counts["fitted"] == 1 and counts["match"] == counts["differs"] == 0
+
+
+def test_a_row_gives_its_claims_with_their_evidence() -> None:
+    row = dict.fromkeys(COLUMNS, "") | {
+        "ours": "near fails: error 2 m; far holds: error 3, 4; 5 m",
+        "null": "near, a coin: 2; far, a coin: 9",
+        "control": "near, no noise: 0",
+        "range": "near for all; far for few",
+    }
+    near, far = claims_of(row)
+    assert (near.id, near.holds, near.ours) == ("near", False, "error 2 m")
+    assert (near.null, near.control, near.range) == (
+        "a coin: 2",
+        "no noise: 0",
+        "for all",
+    )
+    assert (far.id, far.holds, far.ours) == ("far", True, "error 3, 4; 5 m")
+    assert (far.null, far.control, far.range) == ("a coin: 9", "", "for few")

@@ -16,7 +16,7 @@ from sphinx.errors import ExtensionError
 import common
 from bookkit.rows import read_rows
 from common import ROOT, chapters, missing_pages, toc_pages
-from ledger import LEDGER, summaries
+from ledger import LEDGER, claims_of, summaries
 from pages import api_parts, homes, modules
 
 BUILT = ROOT / "_build" / "html"
@@ -98,16 +98,20 @@ def test_api_page_is_an_index_and_chapters_and_names_lead_to_each_other() -> Non
 def test_page_of_reproductions_shows_the_ledger() -> None:
     text = page("book/reproductions")
     rows = read_rows(LEDGER)
-    tables = re.findall(r"<tbody>(.*?)</tbody>", text, flags=re.DOTALL)
-    # Rows of all tables, in the ledger's order
-    lines = [
-        row
-        for table in tables
-        for row in re.findall(r"<tr.*?</tr>", table, flags=re.DOTALL)
-    ]
-    assert len(lines) == len(rows) == 21
-    for row, line in zip(rows, lines, strict=True):
+    tables = re.findall(r"<table.*?</table>", text, flags=re.DOTALL)
+    lines: dict[str, list[str]] = {"Item": [], "Claim": []}
+    # Tables of items and tables of claims, each in the ledger's order
+    for table in tables:
+        head, body = table.split("<tbody>")
+        kind = plain(head).split()[0]
+        lines[kind] += re.findall(r"<tr.*?</tr>", body, flags=re.DOTALL)
+    assert len(lines["Item"]) == len(rows) == 21
+    for row, line in zip(rows, lines["Item"], strict=True):
         assert row["item"] in plain(line) and row["verdict"] in plain(line)
+    # One row a claim, with its own verdict
+    claims = [claim for row in rows for claim in claims_of(row)]
+    for claim, line in zip(claims, lines["Claim"], strict=True):
+        assert ("holds" if claim.holds else "fails") in plain(line)
     # The sentence above the tables must give the same counts.
     for total, counts in summaries(rows).values():
         counted = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())

@@ -30,7 +30,9 @@ class EveryField(State):
 def make_state(rng: np.random.Generator | None) -> EveryField:
     sent = np.array([3, 4])
     lost = np.array([0.5, 0.0])
-    ledger = Ledger(1, sent, 5 * sent, 40 * sent, lost)
+    by_link = (sent, 5 * sent, 40 * sent)
+    by_broadcast = (sent - 1, 4 * sent, 32 * sent)
+    ledger = Ledger(1, *by_link, lost, *by_broadcast)
     # Numbers that a text form would lose: NaN, infinity and the sign of a zero
     special = np.array([np.nan, np.inf, -0.0])
     nested = ((0.1, np.arange(3.0)), (0.2, special))

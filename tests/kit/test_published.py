@@ -340,6 +340,44 @@ def test_a_rule_that_its_null_passes_too_shows_nothing() -> None:
     assert (hangs.verdict, hangs.why) == ("not comparable", "no gain printed")
 
 
+def test_a_failure_that_its_control_shares_shows_nothing() -> None:
+    def below(limit: float) -> Claim:
+        return Claim.from_rule(
+            "pca-stable",
+            "share",
+            lambda s: s < limit,
+            0.2,
+            0.3,
+            "a coin",
+            control=0.05,
+            control_case="exact gains",
+        )
+
+    # Limit 0.1: the rule accepts the control, and ours fails. 0.01: it rejects both.
+    verdicts = [
+        judge_claims("grange", "Fig. 1", [CLAIMS[0], below(x), CLAIMS[2]], why="high")
+        for x in (0.1, 0.01)
+    ]
+    assert [v.verdict for v in verdicts] == ["differs", "not comparable"]
+    assert verdicts[0].control == "pca-stable, exact gains: 0.05"
+    assert verdicts[1].control == "pca-stable, exact gains: 0.05 (fails too)"
+    assert verdicts[1].why == "the rule of pca-stable fails for its control too"
+
+
+def test_a_fitted_input_gives_neither_match_nor_difference() -> None:
+    why = "14 numbers fitted to 9"
+    for claims in (CLAIMS, DENIED):
+        verdict = judge_claims("grange", "Fig. 1", claims, fitted=why, free="no gain")
+        assert (verdict.verdict, verdict.why) == ("fitted", why)
+    # A reader's own scenario is not the fitted one.
+    changed = judge_claims("grange", "Fig. 1", CLAIMS, fitted=why, scenario=CHANGED)
+    assert changed.verdict == "not comparable"
+    # A table of parameters cannot be fitted, and the reason is required.
+    for item, reason in (("Table II", why), ("Fig. 1", "")):
+        with pytest.raises(ValueError, match="^(verdict must|why must)"):
+            Verdict("grange", item, "fitted", "a", "b", reason)
+
+
 def test_a_verdict_is_stored_in_a_notebook() -> None:
     verdict = Verdict("grange", "Fig. 1", "differs", "a", "b", "because <so>")
     bundle = verdict._repr_mimebundle_()

@@ -447,3 +447,72 @@ def test_windows_follow_the_ledger_s_rounds_without_a_time() -> None:
     faults = Faults(loss=1.0, during=[(1, 3)])
     later = star(faults=faults, ledger=channel.ledger)
     assert len(later.broadcast(_ONES)[0]) == 2
+
+
+# The bill by broadcast.
+
+
+def test_one_transmission_serves_all_receivers() -> None:
+    """Payloads for all, mixed vectors, and a silent agent, in both bills."""
+    channel = star()
+    channel.broadcast([np.zeros(5), None, np.zeros(2)])
+    channel.mix(np.zeros((3, 4)), weights.metropolis(STAR), rounds=3)
+    assert has_counts(channel, messages=[2 + 3 * 2, 3, 1 + 3])
+    assert has_counts(channel, transmissions=[1 + 3, 3, 1 + 3])
+    assert has_counts(channel, scalars=[10 + 24, 12, 2 + 12])
+    assert has_counts(channel, broadcast_scalars=[5 + 12, 12, 2 + 12])
+    assert has_counts(channel, broadcast_bytes=8 * channel.ledger.broadcast_scalars)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_losses_and_acknowledgements_in_both_bills(loss: float) -> None:
+    """Acknowledgements go to one agent each, by either bill."""
+    channel = lossy(loss) if loss else star()
+    x = np.zeros((3, 4))
+    channel.mix(x, weights.metropolis(STAR), rounds=5)
+    replies = np.array([10, 5, 5]) if loss else 0
+    assert has_counts(channel, messages=np.array([10, 5, 5]) + replies)
+    assert has_counts(channel, transmissions=5 + replies)
+    assert has_counts(channel, broadcast_scalars=20)
+    assert has_counts(channel, broadcast_bytes=160 + replies)
+
+
+def test_silent_agents_do_not_transmit() -> None:
+    faults = Faults(silent=[0], during=[(1, 3)])
+    channel = star(faults=faults)
+    channel.mix(np.zeros((3, 2)), weights.metropolis(STAR), rounds=4, on_loss="keep")
+    # Nobody sends to an agent that is off either.
+    assert has_counts(channel, transmissions=[2, 2, 2])
+
+
+@pytest.mark.parametrize("runs", [(), (4,)])
+def test_a_payload_for_each_link(runs: tuple[int, ...]) -> None:
+    """Every payload arrives on its own link, and silence costs nothing."""
+    payloads = [np.full((*runs, k + 1), float(k)) for k in range(4)]
+    payloads[2] = None
+    channel = star(runs=runs)
+    arrived = channel.unicast(payloads)
+    assert arrived[2] is None
+    for k in (0, 1, 3):
+        assert (arrived[k] == payloads[k]).all()
+    sizes = np.array([1, 2, 0, 4])
+    sent = np.bincount(STAR.senders, sizes, minlength=3)
+    assert has_counts(channel, scalars=sent, broadcast_scalars=sent)
+    assert has_counts(channel, messages=[1, 1, 1])
+
+
+def test_a_common_payload_in_the_bill_by_broadcast() -> None:
+    channel = star()
+    common = [np.zeros(3), None, None]
+    channel.unicast([None, None, np.zeros(2), np.zeros(1)], common=common)
+    assert has_counts(channel, scalars=[3, 0, 0], broadcast_scalars=[3, 0, 0])
+    assert has_counts(channel, messages=[2, 0, 0], transmissions=[1, 0, 0])
+
+
+def test_lost_unicasts_are_nan_in_their_runs() -> None:
+    channel = lossy(0.5, runs=(30,))
+    arrived = channel.unicast([np.ones((30, 2))] * 4)
+    expected = arrivals(channel.faults, STAR, runs=30)
+    for link, (i, j) in enumerate(zip(STAR.receivers, STAR.senders, strict=True)):
+        assert (~np.isnan(arrived[link][:, 0]) == expected[:, i, j]).all()
+    assert has_counts(channel, scalars=[4, 2, 2])

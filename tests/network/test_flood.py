@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from distfilt import network
-from distfilt.network import Channel, Graph
+from distfilt.network import Channel, Graph, graphs
 from tests.network.helpers import each_graph, rng
 
 
@@ -34,3 +34,37 @@ def test_one_round_reaches_the_neighbours(graph: Graph) -> None:
     assert (known == expected).all()
     means = [values[row].mean(axis=0) for row in expected]
     assert np.allclose(average, means)
+
+
+@each_graph
+def test_split_horizon_sends_less_and_nothing_else_changes(graph: Graph) -> None:
+    values = rng(1).standard_normal((graph.n_agents, 2))
+    echo = Channel(graph)
+    channel = Channel(graph)
+    expected, _ = network.flooding(values, echo)
+    average, known = network.flooding(values, channel, split_horizon=True)
+    assert known.all()
+    assert (average == expected).all()
+    # Every reception is one message less, as its receiver need not send it back: each
+    # value but the own one has come over one link or more.
+    saved = (echo.ledger.scalars - channel.ledger.scalars) / 3
+    assert (saved >= graph.n_agents - 1).all()
+    # By broadcast a value is sent at most once.
+    assert (echo.ledger.broadcast_scalars == 3 * graph.n_agents).all()
+    assert (channel.ledger.broadcast_scalars <= 3 * graph.n_agents).all()
+
+
+def test_on_a_tree_a_value_crosses_each_link_once() -> None:
+    channel = Channel(graphs.star(7))
+    network.flooding(np.zeros((7, 1)), channel, split_horizon=True)
+    assert channel.ledger.scalars.sum() == 2 * 7 * 6
+
+
+def test_split_horizon_with_links_that_go_one_way() -> None:
+    circle = Graph.from_edges(
+        4, [(k, k - 1) for k in range(1, 4)] + [(0, 3)], directed=True
+    )
+    channel = Channel(circle)
+    _, known = network.flooding(np.zeros((4, 1)), channel, split_horizon=True)
+    assert known.all()
+    assert (channel.ledger.scalars == 2 * 4).all()

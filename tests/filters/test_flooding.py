@@ -1,0 +1,142 @@
+"""Observations that travel over several links: who has them, and what they cost."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.random import default_rng
+
+from distfilt.filters import GaussianFilter
+from distfilt.network import Faults, Graph, graphs
+from distfilt.sensors import component
+from tests.filters.families import FAMILIES, PRIOR, TIMES, data, model, still_model
+
+SHARING = [
+    name for name in FAMILIES if name not in ("ensemble, common", "ensemble, exact")
+]
+"""Families that share observations and do not fuse beliefs by default."""
+NETWORKS = {
+    "path": graphs.path(6),
+    "ring": graphs.ring(6),
+    "star": graphs.star(6),
+    "grid": graphs.grid(2, 3),
+}
+each_network = pytest.mark.parametrize("graph", NETWORKS.values(), ids=NETWORKS.keys())
+
+
+def team(agents: int = 6) -> list[Any]:
+    """Sensors of one number, the last agent without one."""
+    sensors: list[Any] = [component([k % 2], std=0.5 + 0.1 * k) for k in range(agents)]
+    return [*sensors[:-1], None]
+
+
+def last_state(
+    graph: Graph, hops: Any, family: str = "gaussian", **options: Any
+) -> Any:
+    """Return the state after a run of a team."""
+    sensors = team(graph.n_agents)
+    _, seen = data(sensors, options.pop("runs", ()))
+    runs = seen[0].shape[1:-1]
+    f = FAMILIES[family](model(), sensors, graph, hops=hops, **options)
+    state = f.start(PRIOR, rng=default_rng(3), runs=runs)
+    *_, last = f.steps(state, TIMES, seen)
+    return last
+
+
+def beliefs(state: Any) -> np.ndarray:
+    for name in ("joint_means", "ensembles", "particles"):
+        if hasattr(state, name):
+            return np.asarray(getattr(state, name))
+    raise AssertionError(name)
+
+
+@pytest.mark.parametrize("family", SHARING)
+def test_flooding_any_connected_graph_is_one_hop_on_a_complete_one(family: str) -> None:
+    """The same observations in the same order: the same numbers."""
+    flooded = last_state(NETWORKS["grid"], "all", family)
+    complete = last_state(graphs.complete(6), 1, family)
+    assert (beliefs(flooded) == beliefs(complete)).all()
+
+
+@each_network
+@pytest.mark.parametrize("hops", [1, 2, 3, "all"])
+def test_observations_come_as_many_links_far(graph: Graph, hops: Any) -> None:
+    """After one step an agent's information is that of the sensors within reach."""
+    sensors = [component([0], std=1.0)] * 6
+    f = GaussianFilter(still_model(1), sensors, graph, hops=hops)
+    state = f.start(([0.0], [[1.0]]))
+    state = f.step(state, 1.0, [[1.0]] * 6)
+    # 1 / P = 1 + number of observations
+    count = 1 / state.covariances.ravel() - 1
+    reach = 6 if hops == "all" else hops
+    expected = [(graph.hops(agent) <= reach).sum() for agent in range(6)]
+    assert np.allclose(count, expected)
+
+
+@pytest.mark.parametrize("agents", [3, 4, 5, 8])
+def test_a_ring_costs_half_of_an_echo(agents: int) -> None:
+    """Own observation on two links, each other one onward: A messages of two numbers."""
+    f = GaussianFilter(
+        still_model(1),
+        [component([0], std=1.0)] * agents,
+        graphs.ring(agents),
+        hops="all",
+    )
+    ledger = f.step(f.start(([0.0], [[1.0]])), 0.0, [[1.0]] * agents).ledger
+    # The farthest agents of an odd ring have it from one side, and send it to each other.
+    assert (ledger.scalars == 2 * (agents + agents % 2)).all()
+    # By broadcast each observation is sent once, unless all neighbours have it.
+    assert (ledger.broadcast_scalars == 2 * (agents - 1 + agents % 2)).all()
+
+
+@pytest.mark.parametrize("graph", [NETWORKS["path"], NETWORKS["star"]])
+def test_on_a_tree_an_observation_crosses_every_link_once(graph: Graph) -> None:
+    f = GaussianFilter(still_model(1), [component([0], std=1.0)] * 6, graph, hops="all")
+    ledger = f.step(f.start(([0.0], [[1.0]])), 0.0, [[1.0]] * 6).ledger
+    assert ledger.scalars.sum() == 6 * 5 * 2
+
+
+def test_lost_messages_run_by_run() -> None:
+    """Each run of a batch has what it would have alone, also by a second way."""
+    graph = graphs.ring(6)
+    sensors = [component([0], std=1.0)] * 6
+    faults = Faults(loss=0.3, seed=4)
+    f = GaussianFilter(still_model(1), sensors, graph, hops="all", faults=faults)
+    values = default_rng(0).standard_normal((6, 40, 1))
+    state = f.step(f.start(([0.0], [[1.0]]), runs=(40,)), 1.0, list(values))
+    count = 1 / state.covariances[..., 0, 0] - 1
+    # From its own plan of losses, by hand.
+    expected = np.zeros((40, 6, 6), dtype=bool)
+    expected[:] = np.eye(6, dtype=bool)
+    fresh = expected.copy()
+    sources = np.zeros((40, 6, 6, 6), dtype=bool)
+    for round_ in range(6):
+        lost = faults.draw_losses(graph, round_, 40)
+        received = np.zeros_like(fresh)
+        for link, (i, j) in enumerate(zip(graph.receivers, graph.senders, strict=True)):
+            # Fresh at j, not from i, and not lost
+            sent = fresh[:, j] & ~sources[:, j, i] & ~lost[:, link, None]
+            sources[:, i, j] |= sent
+            received[:, i] |= sent
+        fresh = received & ~expected
+        expected |= received
+    assert np.allclose(count, expected.sum(axis=2))
+    assert 0 < (count < 5.5).mean() < 1
+
+
+def test_delayed_and_several_observations_are_flooded_too() -> None:
+    """Observations that wait for an exchange keep their time and sensor on the way."""
+    graph = graphs.path(4)
+    sensors = [component([0], std=1.0)] * 4
+    options: dict[str, Any] = {"lag": 4, "exchange_interval": 1.0}
+    seen = [default_rng(k).standard_normal((4, 1)) for k in range(4)]
+    states = []
+    for network, hops in ((graph, "all"), (graphs.complete(4), 1)):
+        f = GaussianFilter(still_model(1, 0.3), sensors, network, hops=hops, **options)
+        *_, last = f.steps(f.start(([0.0], [[1.0]])), [0.3, 0.6, 0.9, 1.2], seen)
+        states.append(last)
+    assert np.array_equal(states[0].joint_means, states[1].joint_means)
+    # All agents have all observations, assimilated in another order.
+    assert np.abs(np.diff(states[0].means, axis=0)).max() < 1e-12
