@@ -331,6 +331,8 @@ def log_sum_exp(logs: Array) -> Array:
     # The bound keeps -inf - (-inf) out of the differences.
     top = np.maximum(logs.max(axis=-1, keepdims=True), -1e300)
     total = np.exp(logs - top).sum(axis=-1, keepdims=True)
+    if np.count_nonzero(total) == total.size:
+        return np.asarray(top + np.log(total))
     with np.errstate(divide="ignore"):
         return np.asarray(top + np.log(total))
 

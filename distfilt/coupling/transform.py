@@ -15,7 +15,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,6 +49,8 @@ SquarableEnsemble = Annotated[ArrayInput, "... n d", SQUARED]
 """Members whose squared distances are finite."""
 Forecast = Annotated[ArrayInput, "*transformed.shape", SQUARED]
 """Members before the transform."""
+Cost = Literal["squared", "distance"]
+"""The squared Euclidean distance of two members, or the distance itself."""
 
 _TIE_BREAK = 1e-7
 """Largest addition to a cost, in units of its range. The weighted mean stays exact, the plan costs
@@ -56,6 +58,8 @@ at most this more."""
 _FAR = 1e-6
 """Members are far from each other if a quarter of the costs is below this part of the range. Above
 it what the addition may cost is at most a tenth of the lower quartile of the costs."""
+_ROUNDING = 1e-28
+"""Copies of a member are up to this part of the largest squared distance apart."""
 _NO_MASS = 1e-15
 """Weights below this are spread evenly where there are far members."""
 
@@ -129,7 +133,9 @@ def _tie_breaker(n: int) -> Array:
 
 
 @validated
-def transport_plans(ensemble: SquarableEnsemble, log_weights: ArrayLike) -> Array:
+def transport_plans(
+    ensemble: SquarableEnsemble, log_weights: ArrayLike, *, cost: Cost = "squared"
+) -> Array:
     """Return optimal couplings of weighted members to the same members with equal weights.
 
     Parameters
@@ -138,11 +144,14 @@ def transport_plans(ensemble: SquarableEnsemble, log_weights: ArrayLike) -> Arra
         Members.
     log_weights : array_like, (..., N)
         Logarithms of their weights, in any normalisation.
+    cost : {"squared", "distance"}
+        What a unit of mass pays: the squared Euclidean distance, which makes the limit of many
+        members a map (Reich), or the distance itself, which Das and Bhattacharya print below (5).
 
     Returns
     -------
     ndarray, (..., N, N)
-        Row i is the distribution of member i's mass; the cost is the squared distance. If several
+        Row i is the distribution of member i's mass. If several
         plans are optimal, as with copies of a member, a fixed addition of at most 1e-7 of the
         largest cost makes the choice. Where members are far from most others it is at most 1e-7
         of the lower quartile of the costs.
@@ -154,33 +163,45 @@ def transport_plans(ensemble: SquarableEnsemble, log_weights: ArrayLike) -> Arra
            [0.  , 0.25]])
     """
     weights = normalize_weights(log_weights, ensemble.shape[:-1])
-    return _solve_plans(ensemble, weights, solver_of("network"))
+    return _solve_plans(ensemble, weights, solver_of("network"), cost)
 
 
-def _solve_plans(ensemble: Array, weights: Array, solve: Solve) -> Array:
-    """Return couplings (..., N, N) of the weights to equal masses, for the squared distance."""
+def _solve_plans(
+    ensemble: Array, weights: Array, solve: Solve, cost: Cost = "squared"
+) -> Array:
+    """Return couplings (..., N, N) of the weights to equal masses, for a distance."""
     n = weights.shape[-1]
     flat_ensemble = ensemble.reshape(-1, *ensemble.shape[-2:])
-    costs = np.array([squared_distances(members) for members in flat_ensemble])
-    return _solve_couplings(costs.reshape(*weights.shape, n), weights, solve)
+    squares = np.array([squared_distances(members) for members in flat_ensemble])
+    costs = squares.reshape(*weights.shape, n)
+    if cost == "distance":
+        return _solve_couplings(np.sqrt(costs), weights, solve, _ROUNDING**0.5)
+    return _solve_couplings(costs, weights, solve)
 
 
-def _solve_couplings(costs: Array, weights: Array, solve: Solve) -> Array:
-    """Return couplings of the weights to equal masses, for costs (..., N, N)."""
+def _solve_couplings(
+    costs: Array, weights: Array, solve: Solve, rounding: float = _ROUNDING
+) -> Array:
+    """Return couplings of the weights to equal masses, for costs (..., N, N).
+
+    Costs up to the part `rounding` of the largest one are those of copies.
+    """
     n = weights.shape[-1]
     equal = np.full(n, 1 / n)
     addition = _tie_breaker(n)
     plans = np.empty_like(costs)
     for index in np.ndindex(weights.shape[:-1]):
         scaled_cost = scale_cost(costs[index])[0]
-        if _has_far_members(scaled_cost):
-            plans[index] = _couple_far_members(costs[index], weights[index], solve)
+        if _has_far_members(scaled_cost, rounding):
+            plans[index] = _couple_far_members(
+                costs[index], weights[index], solve, rounding
+            )
             continue
         plans[index], _ = solve(scaled_cost + addition, weights[index], equal)
     return plans
 
 
-def _has_far_members(scaled_cost: Array) -> bool:
+def _has_far_members(scaled_cost: Array, rounding: float = _ROUNDING) -> bool:
     """Whether a few large costs set the range, so that most are small beside it.
 
     >>> x = np.array([[0.0], [1.0], [2.0], [3.0], [1e4]])
@@ -190,12 +211,14 @@ def _has_far_members(scaled_cost: Array) -> bool:
     False
     """
     # Copies of a member are at no distance, but for rounding.
-    is_apart = scaled_cost > 1e-28
+    is_apart = scaled_cost > rounding
     is_near = is_apart & (scaled_cost < _FAR)
     return bool(4 * np.count_nonzero(is_near) > np.count_nonzero(is_apart))
 
 
-def _couple_far_members(costs: Array, weights: Array, solve: Solve) -> Array:
+def _couple_far_members(
+    costs: Array, weights: Array, solve: Solve, rounding: float
+) -> Array:
     """Return the coupling of the weights to equal masses where some members are far away.
 
     Ties are broken by a part of the typical cost, which is not above the distances of near
@@ -206,7 +229,7 @@ def _couple_far_members(costs: Array, weights: Array, solve: Solve) -> Array:
     rows = np.flatnonzero(weights > _NO_MASS)
     # A constant in a column does not change the plan: far members differ in the rest only.
     needed = costs[rows] - costs[rows].min(axis=0)
-    is_apart = costs > 1e-28 * costs.max()
+    is_apart = costs > rounding * costs.max()
     typical = float(np.quantile(costs[is_apart], 0.25))
     needed = needed + _tie_breaker(n)[rows] * typical
     mass = weights[rows].sum()
@@ -251,6 +274,7 @@ def transform_ensemble(
     regularisation: PositiveFloat = 0.01,
     debias: bool = False,
     correct: bool = False,
+    cost: Cost = "squared",
 ) -> Array:
     r"""Replace weighted members by the same number with equal weights.
 
@@ -270,6 +294,8 @@ def transform_ensemble(
         does not need it: it only swaps members within the tie-breaker of :func:`transport_plans`.
     correct : bool
         Give the new members the weighted covariance too, by :func:`correct_moments`.
+    cost : {"squared", "distance"}
+        As for :func:`transport_plans`.
 
     Returns
     -------
@@ -291,11 +317,11 @@ def transform_ensemble(
     weights = normalize_weights(log_weights, ensemble.shape[:-1])
     solve = solver_of(solver, regularisation)
     # X+ = X N T.
-    plans = _solve_plans(ensemble, weights, solve)
+    plans = _solve_plans(ensemble, weights, solve, cost)
     transformed = apply_plan(ensemble, weights, plans)
     if debias:
         equal = np.full(weights.shape, 1 / ensemble.shape[-2])
-        plans = _solve_plans(ensemble, equal, solve)
+        plans = _solve_plans(ensemble, equal, solve, cost)
         # x_j - N sum_i t_ij x_i for equal weights is the solver's own displacement.
         transformed += ensemble - apply_plan(ensemble, equal, plans)
         # The mean becomes the weighted one again.

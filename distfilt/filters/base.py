@@ -88,7 +88,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
     faults: Faults | None = None
     names: Sequence[str] = ()
 
-    state_class: ClassVar[type[Any]] = State
+    state_class: ClassVar[type[State]] = State
     requires_rng: ClassVar[bool] = False
     supports_runs: ClassVar[bool] = True
     batched_summary: ClassVar[bool] = False
@@ -201,13 +201,13 @@ class Filter(FrozenModel, ABC, Generic[S]):
 
     @abstractmethod
     def read_observations(
-        self, observations: Any, runs: tuple[int, ...], t: float
+        self, observations: object, runs: tuple[int, ...], t: float
     ) -> Any:
         """Check the observations of one time, and return them as `next_state` needs them."""
 
     @abstractmethod
     def initial_state(
-        self, prior: Any, runs: tuple[int, ...], rng: Any
+        self, prior: Prior, runs: tuple[int, ...], rng: np.random.Generator | None
     ) -> dict[str, Any]:
         """Return the family's own fields of the first state."""
 
@@ -281,7 +281,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         self,
         state: S,
         t: float,
-        observations: Any,
+        observations: object,
         *,
         delayed: Sequence[Observation] = (),
     ) -> S:
@@ -320,7 +320,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         self,
         state: S,
         t: float,
-        observations: Any,
+        observations: object,
         delayed: Sequence[Observation],
         *,
         reuse_rng: bool = False,
@@ -387,7 +387,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         self,
         state: S,
         times: TimesArgument,
-        observations: Any,
+        observations: object,
         *,
         delayed: Sequence[Observation] = (),
     ) -> Iterator[S]:
@@ -400,7 +400,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         self,
         state: S,
         grid: Array,
-        entries: Iterable[Any],
+        entries: Iterable[Sequence[object]],
         delayed: Sequence[Observation],
         *,
         reuse_rng: bool,
@@ -434,7 +434,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         self,
         state: S,
         times: TimesArgument,
-        observations: Any,
+        observations: object,
         *,
         truth: Truth = None,
         scores: Collection[Score] = SCORES,
@@ -488,8 +488,8 @@ class Filter(FrozenModel, ABC, Generic[S]):
     def _record(
         self,
         state: S,
-        times: Any,
-        observations: Any,
+        times: TimesArgument,
+        observations: object,
         truth: Truth,
         scores: Collection[Score],
         delayed: Sequence[Observation],
@@ -672,8 +672,8 @@ class SensorFilter(Filter[S]):
         self,
         state: S,
         components: Sequence[int | str],
-        value: Any,
-        cov: Any,
+        value: object,
+        cov: object,
         *,
         agents: Sequence[int] | None = None,
     ) -> S:
@@ -758,8 +758,8 @@ class SensorFilter(Filter[S]):
         return channel
 
     def read_observations(
-        self, observations: Any, runs: tuple[int, ...], t: float
-    ) -> Any:
+        self, observations: object, runs: tuple[int, ...], t: float
+    ) -> list[list[Observation]]:
         """Check the observations of one time, and return a list of them for each agent."""
         sizes = self.observation_sizes
         if type(observations) is not list or len(observations) != len(sizes):
@@ -799,7 +799,7 @@ def _smooth_states(states: Iterable[Any], lag: int) -> Iterator[tuple[Any, Any]]
         for state in states:
             yield state, state
         return
-    recent: list[Any] = []
+    recent: list[SensorState] = []
     for state in states:
         recent.append(state)
         steps = [one.t for one in recent]

@@ -58,7 +58,7 @@ from .options import (
 from .priors import Prior, draw_members, split_by_agent
 from .record import Summary
 from .resets import Reset, reset_members
-from .states import SensorState
+from .states import AnyState, SensorState, State
 from .step import Received, Step, copy_rng
 
 __all__ = ["EnsembleFilter", "EnsembleState", "TransportFilter"]
@@ -157,7 +157,7 @@ class MembersFilter(
 class _EnsembleSummary(MembersFilter[EnsembleState]):
     """A filter whose state is an ensemble for each agent."""
 
-    state_class: ClassVar[type[Any]] = EnsembleState
+    state_class: ClassVar[type[State]] = EnsembleState
     batched_summary: ClassVar[bool] = True
 
     def summarize(self, state: EnsembleState) -> Summary:
@@ -292,7 +292,7 @@ class EnsembleFilter(
 
     def initial_state(
         self, prior: Prior, runs: tuple[int, ...], rng: Any
-    ) -> dict[str, Any]:
+    ) -> dict[str, object]:
         """Draw members for each agent."""
         members = self.draw_prior(prior, (*runs, self.n_agents), rng)
         return {"ensembles": settle(members, self.periods)}
@@ -453,7 +453,7 @@ class EnsembleFilter(
         return check_array(new, "update", x.shape, finite=False)
 
 
-def _check_shape(values: Any, name: str, shape: tuple[int, ...]) -> None:
+def _check_shape(values: Array, name: str, shape: tuple[int, ...]) -> None:
     """Refuse a result that is no float64 array of the ensembles' shape."""
     is_array = type(values) is np.ndarray and values.dtype == np.float64
     if not is_array or values.shape != shape:
@@ -503,7 +503,7 @@ class TransportFilter(_EnsembleSummary):
     """
 
     _: KW_ONLY
-    fusion: Callable[..., Any] | None = finite_time_consensus
+    fusion: Callable[..., object] | None = finite_time_consensus
     correct: bool = False
     rejuvenation: NonNegativeFloat = 0.0
 
@@ -512,7 +512,7 @@ class TransportFilter(_EnsembleSummary):
 
     def initial_state(
         self, prior: Prior, runs: tuple[int, ...], rng: Any
-    ) -> dict[str, Any]:
+    ) -> dict[str, object]:
         """Draw one set of members, (N, d) or (*runs, 1, N, d), for all agents."""
         if split_by_agent(prior, self.model.dim, self.n_agents) is not None:
             raise ValueError(
@@ -630,7 +630,7 @@ class TransportFilter(_EnsembleSummary):
             weights = normalize_weights(logs)
             stack = [fold(members, self.periods, weights) for members in stack]
 
-        def compute(logs: Array, *args: Any) -> tuple[Array, ...]:
+        def compute(logs: Array, *args: Array) -> tuple[Array, ...]:
             *times, _, _ = args
             # The plan is optimal for the present members and moves their past along.
             weights = normalize_weights(logs)
@@ -681,7 +681,7 @@ class TransportFilter(_EnsembleSummary):
             )
 
 
-def fuse_members(step: Step[Any], members: Array) -> Array:
+def fuse_members(step: Step[AnyState], members: Array) -> Array:
     """Return members (*runs, A, N, d) after the fusion rule, on the branch before it.
 
     The rule gets all agents' members on one branch.

@@ -19,6 +19,7 @@ from .observations import Observation, sensor_of
 
 if TYPE_CHECKING:
     from .changes import References
+    from .states import AnyState
     from .step import Step
 
 __all__ = ["Known", "collect_observations", "fuse_beliefs"]
@@ -27,7 +28,7 @@ Known = dict[float, list[list[tuple[Sensor, Array]]]]
 """By time and then by agent: the sensors and values of the observations that the agent has."""
 
 
-def collect_observations(step: Step[Any]) -> Known:
+def collect_observations(step: Step[AnyState]) -> Known:
     """Share the step's observations, and sort by time those that each agent has then.
 
     An agent has its own observations and those that others sent, ordered by their agents.
@@ -81,7 +82,7 @@ def _receive_changes(
 
 
 def _choose_outgoing(
-    step: Step[Any], observed: list[list[Observation]]
+    step: Step[AnyState], observed: list[list[Observation]]
 ) -> list[list[Observation]]:
     """Choose each agent's messages of this step: nothing, or its new and its pending observations.
 
@@ -115,7 +116,9 @@ def _choose_outgoing(
     return [old + new for old, new in zip(outgoing, observed, strict=True)]
 
 
-def _refuse_waiting_changes(step: Step[Any], observed: list[list[Observation]]) -> None:
+def _refuse_waiting_changes(
+    step: Step[AnyState], observed: list[list[Observation]]
+) -> None:
     """Refuse observations of changes that would wait for the next contact."""
     for of_agent in observed:
         for observation in of_agent:
@@ -127,7 +130,7 @@ def _refuse_waiting_changes(step: Step[Any], observed: list[list[Observation]]) 
                 )
 
 
-def _pack(step: Step[Any], observations: list[Observation]) -> Any:
+def _pack(step: Step[AnyState], observations: list[Observation]) -> Any:
     """Pack an agent's observations into one payload; None if there is none.
 
     The usual case, one present observation of the agent's first sensor, is its value alone.
@@ -143,7 +146,7 @@ def _pack(step: Step[Any], observations: list[Observation]) -> Any:
     return (*[observation.value for observation in observations], labels)
 
 
-def _describe(step: Step[Any], observations: list[Observation]) -> list[float]:
+def _describe(step: Step[AnyState], observations: list[Observation]) -> list[float]:
     """Return the numbers that travel with observations: time, sensor and metadata of each.
 
     One present observation of the agent's first sensor needs none.
@@ -158,7 +161,7 @@ def _describe(step: Step[Any], observations: list[Observation]) -> list[float]:
     return [] if is_plain else numbers
 
 
-def _flood(step: Step[Any], sent: list[list[Observation]]) -> list[dict[int, Any]]:
+def _flood(step: Step[AnyState], sent: list[list[Observation]]) -> list[dict[int, Any]]:
     """Send observations over several links; the values that each agent receives, by their agent.
 
     The number of the agent that made them travels with them.
@@ -175,7 +178,7 @@ def _flood(step: Step[Any], sent: list[list[Observation]]) -> list[dict[int, Any
 
 
 def _label(
-    step: Step[Any], observations: list[Observation]
+    step: Step[AnyState], observations: list[Observation]
 ) -> list[tuple[float, Sensor]]:
     """Return the time and the sensor of each observation."""
     labels = []
@@ -187,7 +190,7 @@ def _label(
     return labels
 
 
-def fuse_beliefs(step: Step[Any], values: tuple[Array, ...]) -> tuple[Array, ...]:
+def fuse_beliefs(step: Step[AnyState], values: tuple[Array, ...]) -> tuple[Array, ...]:
     """Apply the filter's fusion rule to values (*runs, A, ...).
 
     The rule gets all runs at once. If it raises, each run is fused alone. Failed runs keep their

@@ -25,6 +25,12 @@ from .fusion import (
 from .gossip import gossip_consensus
 from .graphs import Graph
 from .ledger import Ledger
+from .pairwise import (
+    covariance_union,
+    ellipsoidal_intersection,
+    inverse_covariance_intersection,
+    split_covariance_intersection,
+)
 from .pi_estimator import PIState, pi_start, pi_step, stable_substeps
 from .weights import ConsensusWeights, UnstableGain
 
@@ -43,6 +49,8 @@ __all__ = [
     "average_consensus",
     "consensus_pull",
     "covariance_intersection",
+    "covariance_union",
+    "ellipsoidal_intersection",
     "event_triggered",
     "finite_time_consensus",
     "flooding",
@@ -50,12 +58,14 @@ __all__ = [
     "gossip_consensus",
     "graphs",
     "intersect_ensembles",
+    "inverse_covariance_intersection",
     "max_consensus",
     "mean_pull",
     "naive_fusion",
     "pi_start",
     "pi_step",
     "push_sum",
+    "split_covariance_intersection",
     "stable_substeps",
     "weights",
 ]

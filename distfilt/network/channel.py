@@ -36,6 +36,12 @@ __all__ = ["Channel", "LossRule", "PerAgent", "fusion_rule", "kind_of_rule"]
 
 _PERFECT = Faults()
 
+_BILLS = (
+    *("messages", "scalars", "bytes"),
+    *("transmissions", "broadcast_scalars", "broadcast_bytes"),
+)
+"""The counts of a ledger by link, and by broadcast."""
+
 _BLOCK_SIZE = 2**15
 """Number of messages whose losses are drawn at a time."""
 
@@ -237,12 +243,12 @@ class Channel:
         n_links = graph.senders.size
         copies, scalars, bytes_ = count_payload(payloads, n_links, self.runs)
         sent = cast(list[P | None], copies)
-        transmission = None
+        size = _Size(scalars, bytes_)
         if common is not None:
-            _, *transmission_size = count_payload(common, graph.n_agents, self.runs)
-            transmission = (transmission_size[0], transmission_size[1])
+            _, *of_agents = count_payload(common, graph.n_agents, self.runs)
+            size = _Size(scalars, bytes_, (of_agents[0], of_agents[1]))
         used = np.array([payload is not None for payload in sent], dtype=bool)
-        arrived = self._transmit(used, _Size(scalars, bytes_, transmission))
+        arrived = self._transmit(used, size)
         result: list[P | None] = []
         for link, payload in enumerate(sent):
             if payload is None or not arrived[:, link].any():
@@ -533,10 +539,8 @@ class Channel:
             for k in (0, 2, 3, 5):
                 bills[k] = bills[k] + replies
         ledger = self.ledger
-        names = ("messages", "scalars", "bytes")
-        names += ("transmissions", "broadcast_scalars", "broadcast_bytes")
         totals: dict[str, Any] = {}
-        for name, amount in zip(names, bills, strict=True):
+        for name, amount in zip(_BILLS, bills, strict=True):
             totals[name] = getattr(ledger, name) + np.asarray(amount, dtype=np.int64)
         # Without links there is no round.
         if graph.senders.size:

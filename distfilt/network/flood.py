@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..validation import Array, Mask, PositiveInt, validated
+from ..validation import Array, Indices, Mask, PositiveInt, validated
 from .channel import Channel, PerAgent
 from .consensus import _check_single_run, _warn_if_disconnected
+from .graphs import Graph
 
 __all__ = ["flooding"]
 
 
 @validated
 def flooding(
-    values: PerAgent, channel: Channel, *, rounds: PositiveInt | None = None
+    values: PerAgent,
+    channel: Channel,
+    *,
+    rounds: PositiveInt | None = None,
+    split_horizon: bool = False,
 ) -> tuple[Array, Mask]:
     """Flood values: every agent forwards each value once, when it first receives it.
 
@@ -28,6 +33,10 @@ def flooding(
         sent again. A graph of several components gives a :class:`Disconnected` warning.
     rounds : int, optional
         Number of rounds; by default until no agent has a new value to forward.
+    split_horizon : bool
+        Whether a value is never sent back over a link by which it came. Nothing else
+        changes: on a ring half of the messages are saved, on a tree each value crosses
+        each link once.
 
     Returns
     -------
@@ -44,26 +53,50 @@ def flooding(
     array([3., 3., 3.])
     >>> channel.ledger.scalars
     array([ 6, 12,  6])
+    >>> channel = Channel(graphs.path(3))
+    >>> _ = flooding([[0.0], [3.0], [6.0]], channel, split_horizon=True)
+    >>> channel.ledger.scalars
+    array([2, 8, 2])
     """
     _check_single_run(channel)
     _warn_if_disconnected(channel, rounds)
-    n_agents = channel.graph.n_agents
+    graph = channel.graph
+    n_agents = graph.n_agents
     # A row to send: the number of the agent and its value.
     numbers = np.arange(n_agents)[:, None]
     table = np.concatenate([numbers, values], axis=1)
     known = np.eye(n_agents, dtype=bool)
     new = known
+    opposite = _find_opposite(graph)
+    # Which values have come over which link; the last row stands for no link at all.
+    came = np.zeros((graph.senders.size + 1, n_agents), dtype=bool)
     # A value travels over at most A - 1 links, so that the default is never reached.
     rounds_left = rounds or 2 * n_agents
     while new.any() and rounds_left:
         rounds_left -= 1
-        payloads = [table[rows] if rows.any() else None for rows in new]
+        outgoing = new[graph.senders]
+        if split_horizon:
+            outgoing = outgoing & ~came[opposite]
+        # One transmission for all receivers holds what any of them needs.
+        needed = np.zeros_like(known)
+        np.logical_or.at(needed, graph.senders, outgoing)
+        payloads = [table[rows] if rows.any() else None for rows in outgoing]
+        common = [table[rows] if rows.any() else None for rows in needed]
         received = np.zeros_like(known)
-        for agent, inbox in enumerate(channel.broadcast(payloads)):
-            for rows in inbox.values():
-                received[agent, rows[:, 0].astype(int)] = True
+        for link, rows in enumerate(channel.unicast(payloads, common=common)):
+            if rows is not None:
+                came[link, rows[:, 0].astype(int)] = True
+                received[graph.receivers[link]] |= came[link]
         # Only first receptions are forwarded in the next round.
         new = received & ~known
         known = known | new
     average = [values[row].mean(axis=0) for row in known]
     return np.array(average), known
+
+
+def _find_opposite(graph: Graph) -> Indices:
+    """Return the number of each link's opposite link; that of the last one and 1 if none is."""
+    ends = list(zip(graph.receivers.tolist(), graph.senders.tolist(), strict=True))
+    numbers = {pair: link for link, pair in enumerate(ends)}
+    opposite = [numbers.get((sender, agent), len(ends)) for agent, sender in ends]
+    return np.array(opposite, dtype=np.int64)

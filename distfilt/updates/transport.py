@@ -186,6 +186,7 @@ def etpf(
     rng: Rng,
     correct: bool = False,
     rejuvenation: NonNegativeFloat = 0.0,
+    cost: Literal["squared", "distance"] = "squared",
 ) -> Array:
     r"""Weight the members by their likelihoods and transport them to equal weights, (3)-(5).
 
@@ -208,6 +209,8 @@ def etpf(
         Give the members the weighted covariance too.
     rejuvenation : float
         h of :func:`distfilt.coupling.rejuvenate`; 0 draws nothing.
+    cost : {"squared", "distance"}
+        As for :func:`distfilt.coupling.transport_plans`. Das and Bhattacharya print the distance.
 
     Returns
     -------
@@ -236,7 +239,9 @@ def etpf(
     # w_i ∝ p(y* | x_i), then members of equal weights by the optimal coupling.
     log_weights = log_likelihood(predicted, observed, noise)
     warn_of_weights(log_weights, predicted, observed, noise)
-    analysis = coupling.transform_ensemble(ensemble, log_weights, correct=correct)
+    analysis = coupling.transform_ensemble(
+        ensemble, log_weights, correct=correct, cost=cost
+    )
     if not rejuvenation:
         return analysis
     return coupling.rejuvenate(analysis, ensemble, bandwidth=rejuvenation, rng=rng)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from functools import cached_property, partial, wraps
 from inspect import Parameter, signature
@@ -199,8 +198,7 @@ def validated(
     return cast(F, wrapper)
 
 
-@contextmanager
-def skip_validation() -> Iterator[None]:
+class skip_validation:  # the name of a context manager is a verb
     """Skip the checks of all validated functions, in a loop whose arguments are known to fit.
 
     Arrays must then be float64 arrays of the declared shapes, since nothing is converted either.
@@ -213,11 +211,13 @@ def skip_validation() -> Iterator[None]:
     ...     wrap(np.array([4.0])).round(3)
     array([-2.283])
     """
-    token = _NESTED.set(True)
-    try:
-        yield
-    finally:
-        _NESTED.reset(token)
+    __slots__ = ("_token",)
+
+    def __enter__(self) -> None:
+        self._token = _NESTED.set(True)
+
+    def __exit__(self, *_: object) -> None:
+        _NESTED.reset(self._token)
 
 
 def check_signature(

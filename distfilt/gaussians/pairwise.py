@@ -1,0 +1,361 @@
+r"""Fusion of two Gaussians whose errors are correlated, each by another bound of the correlation.
+
+All functions work in the coordinates :math:`\mathbf z=\mathbf T^{-1}\mathbf x` in which both
+covariances are diagonal: with :math:`\mathbf P_a=\mathbf L\mathbf L^\top` and
+:math:`\mathbf L^{-1}\mathbf P_b\mathbf L^{-\top}=\mathbf V\mathbf D\mathbf V^\top` let
+:math:`\mathbf T=\mathbf L\mathbf V`, so that :math:`\mathbf P_a=\mathbf T\mathbf T^\top` and
+:math:`\mathbf P_b=\mathbf T\mathbf D\mathbf T^\top`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Literal
+
+import numpy as np
+
+from ..linalg import (
+    broadcast_leading,
+    cholesky,
+    log_det,
+    solve_definite,
+    solve_lower,
+    symmetrise,
+)
+from ..validation import (
+    Array,
+    ArrayInput,
+    PositiveDefinite,
+    PositiveSemidefinite,
+    UnitInterval,
+    validated,
+)
+
+__all__ = [
+    "intersect_ellipsoids",
+    "intersect_inverses",
+    "intersect_split",
+    "unite_gaussians",
+]
+
+Mean = Annotated[ArrayInput, "... d"]
+Cov = Annotated[PositiveDefinite, "... d d"]
+Part = Annotated[PositiveSemidefinite, "... d d"]
+Size = Literal["min_trace", "min_determinant"]
+"""The size of a covariance that a weight makes smallest."""
+
+_POINTS = 17
+"""Points of a search along the unit interval."""
+_STAGES = 7
+"""Each stage of a search leaves an eighth of the interval."""
+_MARGIN = 1e-6
+"""Smallest distance of a weight that is searched for from 0 and 1."""
+_TIE = 1e-9
+"""Relative difference of variances that count as equal."""
+
+
+@validated
+def intersect_inverses(
+    mean_a: Mean,
+    cov_a: Cov,
+    mean_b: Mean,
+    cov_b: Cov,
+    *,
+    omega: UnitInterval | None = None,
+    rule: Size = "min_determinant",
+) -> tuple[Array, Array]:
+    r"""Fuse two Gaussians by inverse covariance intersection.
+
+    .. math:: \mathbf P^{-1}=\mathbf P_a^{-1}+\mathbf P_b^{-1}
+        -\bigl(\omega\mathbf P_a+(1-\omega)\mathbf P_b\bigr)^{-1}
+
+    The last term bounds the information that both may have in common. If the two were made by
+    adding independent information to one common estimate, whichever it is, the covariance of the
+    error is at most P. It is never larger than that of covariance intersection with the same ω.
+
+    Parameters
+    ----------
+    mean_a, mean_b : array_like, (..., d)
+    cov_a, cov_b : array_like, (..., d, d)
+        Positive definite. Leading axes of all four broadcast.
+    omega : float, optional
+        The weight ω in [0, 1]; by default the one of the smallest result.
+    rule : {"min_trace", "min_determinant"}
+        The size that is made smallest.
+
+    Notes
+    -----
+    B. Noack, J. Sijs, M. Reinhardt and U. D. Hanebeck, Automatica 79 (2017) 35-41.
+
+    Examples
+    --------
+    >>> mean, cov = intersect_inverses([0.0], [[1.0]], [3.0], [[2.0]], omega=0.5)
+    >>> mean.round(6), cov.round(6)
+    (array([0.6]), array([[1.2]]))
+    """
+    transform, d, z = _diagonalise(mean_a, cov_a, mean_b, cov_b)
+    scale = (transform**2).sum(axis=-2)
+
+    def variances(weight: Array) -> Array:
+        """Return the variances in the common coordinates, (..., d), for weights (...)."""
+        w = weight[..., None]
+        return np.asarray(1 / (1 + 1 / d - 1 / (w + (1 - w) * d)))
+
+    def size(weights: Array) -> Array:
+        # The points of the search come last: (..., points).
+        p = np.stack([variances(w) for w in np.moveaxis(weights, -1, 0)], axis=-2)
+        if rule == "min_trace":
+            return np.asarray((scale[..., None, :] * p).sum(axis=-1))
+        return np.asarray(np.log(p).sum(axis=-1))
+
+    weight = _choose_weight(omega, size, d.shape[:-1])
+    p = variances(weight)
+    w = weight[..., None]
+    # The gain of b: P (P_b⁻¹ - (1 - ω) (ω P_a + (1 - ω) P_b)⁻¹)
+    gain = p * (1 / d - (1 - w) / (w + (1 - w) * d))
+    return _return_from(transform, mean_a, gain * z, p)
+
+
+@validated
+def intersect_ellipsoids(
+    mean_a: Mean, cov_a: Cov, mean_b: Mean, cov_b: Cov
+) -> tuple[Array, Array]:
+    r"""Fuse two Gaussians by ellipsoidal intersection.
+
+    .. math:: \mathbf P^{-1}=\mathbf P_a^{-1}+\mathbf P_b^{-1}-\boldsymbol\Gamma^{-1},\qquad
+        \boldsymbol\Gamma=\mathbf T\max(\mathbf I,\mathbf D)\mathbf T^\top
+
+    All information that both could have in common, :math:`\boldsymbol\Gamma^{-1}`, is counted
+    once: along each axis of the common coordinates the more accurate of the two is taken, and
+    where both are equally accurate the mean of them. P is the largest covariance that is below
+    both; it is no bound of the error for every correlation.
+
+    Parameters
+    ----------
+    mean_a, cov_a, mean_b, cov_b
+        As of :func:`intersect_inverses`.
+
+    Notes
+    -----
+    J. Sijs and M. Lazar, Automatica 48 (2012) 1874-1878, (8) to (16).
+
+    Examples
+    --------
+    >>> mean, cov = intersect_ellipsoids(
+    ...     [0.0, 0.0], np.diag([1.0, 4.0]), [1.0, 1.0], np.diag([2.0, 3.0])
+    ... )
+    >>> mean, cov
+    (array([0., 1.]), array([[1., 0.],
+           [0., 3.]]))
+    """
+    transform, d, z = _diagonalise(mean_a, cov_a, mean_b, cov_b)
+    # The limit of the paper's (16) for η to zero: all weight on the smaller variance.
+    gain = np.where(np.abs(d - 1) < _TIE, 0.5, (d < 1).astype(np.float64))
+    return _return_from(transform, mean_a, gain * z, np.minimum(1.0, d))
+
+
+@validated
+def intersect_split(
+    mean_a: Mean,
+    dependent_a: Part,
+    independent_a: Part,
+    mean_b: Mean,
+    dependent_b: Part,
+    independent_b: Part,
+    *,
+    omega: UnitInterval | None = None,
+    rule: Size = "min_determinant",
+) -> tuple[Array, Array, Array]:
+    r"""Fuse two estimates whose errors have a correlated and an independent part.
+
+    .. math:: \mathbf A=\mathbf D_a/\omega+\mathbf I_a,\qquad
+        \mathbf B=\mathbf D_b/(1-\omega)+\mathbf I_b,\qquad
+        \mathbf P^{-1}=\mathbf A^{-1}+\mathbf B^{-1}
+
+    Split covariance intersection: only the dependent parts D are enlarged. The result bounds the
+    error for any correlation of the dependent parts. Without independent parts it is covariance
+    intersection, without dependent ones the product of the densities.
+
+    Parameters
+    ----------
+    mean_a, mean_b : array_like, (..., d)
+    dependent_a, dependent_b : array_like, (..., d, d)
+        Covariances of the parts that may be correlated in any way, positive semidefinite.
+    independent_a, independent_b : array_like, (..., d, d)
+        Covariances of the parts that are independent of everything else. The sum of both parts
+        is positive definite.
+    omega, rule
+        As of :func:`intersect_inverses`.
+
+    Returns
+    -------
+    mean, dependent, independent : ndarray
+        The fused estimate, and the two parts of its covariance.
+
+    Notes
+    -----
+    S. J. Julier and J. K. Uhlmann, in D. L. Hall and J. Llinas (eds.), Handbook of Multisensor
+    Data Fusion (2001), chapter 12.
+
+    Examples
+    --------
+    >>> parts = intersect_split(
+    ...     [0.0], [[1.0]], [[1.0]], [4.0], [[1.0]], [[1.0]], omega=0.5
+    ... )
+    >>> [part.round(6).tolist() for part in parts]
+    [[2.0], [[1.0]], [[0.5]]]
+    """
+    d = mean_a.shape[-1]
+    leading = np.broadcast_shapes(
+        mean_a.shape[:-1],
+        mean_b.shape[:-1],
+        *[m.shape[:-2] for m in (dependent_a, dependent_b)],
+        *[m.shape[:-2] for m in (independent_a, independent_b)],
+    )
+
+    def informations(weight: Array) -> tuple[Array, Array]:
+        """Return A⁻¹ and B⁻¹ = ω (D + ω I)⁻¹ without a division by the weight."""
+        w = weight[..., None, None]
+        unit = np.broadcast_to(np.eye(d), (*weight.shape, d, d))
+        a = w * solve_definite(dependent_a + w * independent_a, unit)
+        b = (1 - w) * solve_definite(dependent_b + (1 - w) * independent_b, unit)
+        return a, b
+
+    def size(weights: Array) -> Array:
+        values = []
+        for weight in np.moveaxis(weights, -1, 0):
+            a, b = informations(weight)
+            lower = cholesky(symmetrise(a + b))
+            if rule == "min_determinant":
+                values.append(-log_det(lower))
+            else:
+                # tr P = |C⁻¹|² for P⁻¹ = C Cᵀ
+                root = solve_lower(lower, np.broadcast_to(np.eye(d), lower.shape))
+                values.append((root**2).sum(axis=(-2, -1)))
+        return np.stack(values, axis=-1)
+
+    weight = _choose_weight(omega, size, leading)
+    a, b = informations(weight)
+    total = symmetrise(a + b)
+    gain_a = solve_definite(total, a)
+    gain_b = solve_definite(total, b)
+    mean = mean_a + (gain_b @ (mean_b - mean_a)[..., None])[..., 0]
+    # P = K A Kᵀ + L B Lᵀ, of which K I_a Kᵀ + L I_b Lᵀ is independent.
+    independent = (
+        gain_a @ independent_a @ gain_a.mT + gain_b @ independent_b @ gain_b.mT
+    )
+    unit = np.broadcast_to(np.eye(d), total.shape)
+    cov = solve_definite(total, unit)
+    return mean, symmetrise(cov - independent), symmetrise(independent)
+
+
+@validated
+def unite_gaussians(
+    mean_a: Mean,
+    cov_a: Cov,
+    mean_b: Mean,
+    cov_b: Cov,
+    *,
+    omega: UnitInterval | None = None,
+    rule: Size = "min_determinant",
+) -> tuple[Array, Array]:
+    r"""Cover two Gaussians, of which one may be wrong, by covariance union.
+
+    .. math:: \mathbf P\succeq\mathbf P_a+(\mathbf m-\mathbf m_a)(\mathbf m-\mathbf m_a)^\top,
+        \qquad
+        \mathbf P\succeq\mathbf P_b+(\mathbf m-\mathbf m_b)(\mathbf m-\mathbf m_b)^\top
+
+    If one of the two is consistent, whichever it is, the result is. The mean is
+    :math:`\mathbf m=(1-\omega)\mathbf m_a+\omega\mathbf m_b`, and P the smallest covariance, in
+    the common coordinates of the two on the right, that is above both.
+
+    Parameters
+    ----------
+    mean_a, cov_a, mean_b, cov_b, rule
+        As of :func:`intersect_inverses`.
+    omega : float, optional
+        The place of the mean between the two, in [0, 1]; by default that of the smallest result.
+
+    Notes
+    -----
+    J. K. Uhlmann, Information Fusion 4 (2003) 201-215; S. Reece and S. Roberts, Conference on
+    Information Fusion (2006).
+
+    Examples
+    --------
+    >>> mean, cov = unite_gaussians([0.0], [[1.0]], [4.0], [[1.0]])
+    >>> mean.round(6), cov.round(6)
+    (array([2.]), array([[5.]]))
+    """
+    leading = broadcast_leading(mean_a.shape[:-1], mean_b.shape[:-1], "mean_b")
+    leading = broadcast_leading(leading, cov_a.shape[:-2], "cov_a")
+    leading = broadcast_leading(leading, cov_b.shape[:-2], "cov_b")
+    difference = np.broadcast_to(mean_b - mean_a, (*leading, mean_a.shape[-1]))
+    square = difference[..., :, None] * difference[..., None, :]
+
+    def cover(weight: Array) -> Array:
+        """Return a factor of the smallest covariance above both, (..., d, d)."""
+        w = weight[..., None, None]
+        first = cov_a + w**2 * square
+        second = cov_b + (1 - w) ** 2 * square
+        transform, d, _ = _diagonalise(difference, first, difference, second)
+        # T max(1, D) Tᵀ
+        return np.asarray(transform * np.sqrt(np.maximum(1.0, d))[..., None, :])
+
+    def size(weights: Array) -> Array:
+        factors = np.stack([cover(w) for w in np.moveaxis(weights, -1, 0)], axis=-3)
+        if rule == "min_trace":
+            return np.asarray((factors**2).sum(axis=(-2, -1)))
+        return np.asarray(np.linalg.slogdet(factors)[1])
+
+    weight = _choose_weight(omega, size, leading)
+    factor = cover(weight)
+    return mean_a + weight[..., None] * difference, symmetrise(factor @ factor.mT)
+
+
+def _diagonalise(
+    mean_a: Array, cov_a: Array, mean_b: Array, cov_b: Array
+) -> tuple[Array, Array, Array]:
+    """Return T, the diagonal of D, and T⁻¹ (m_b - m_a), of which the leading axes are equal."""
+    leading = broadcast_leading(mean_a.shape[:-1], mean_b.shape[:-1], "mean_b")
+    leading = broadcast_leading(leading, cov_a.shape[:-2], "cov_a")
+    leading = broadcast_leading(leading, cov_b.shape[:-2], "cov_b")
+    size = cov_a.shape[-1]
+    lower = np.broadcast_to(cholesky(cov_a), (*leading, size, size))
+    # L⁻¹ P_b L⁻ᵀ = V D Vᵀ
+    half = solve_lower(lower, np.broadcast_to(cov_b, lower.shape))
+    white = solve_lower(lower, np.ascontiguousarray(half.mT))
+    d, axes = np.linalg.eigh(symmetrise(white))
+    difference = np.broadcast_to(mean_b - mean_a, (*leading, size))
+    z = axes.mT @ solve_lower(lower, difference[..., None])
+    return lower @ axes, d, z[..., 0]
+
+
+def _return_from(
+    transform: Array, mean_a: Array, shift: Array, variances: Array
+) -> tuple[Array, Array]:
+    """Return the mean and the covariance T diag(p) Tᵀ of a Gaussian in the common coordinates."""
+    mean = mean_a + (transform @ shift[..., None])[..., 0]
+    cov = (transform * variances[..., None, :]) @ transform.mT
+    return mean, symmetrise(cov)
+
+
+def _choose_weight(
+    omega: float | None, size: Callable[[Array], Array], leading: tuple[int, ...]
+) -> Array:
+    """Return a given weight, or those in [0, 1] for which a size (..., points) is smallest."""
+    if omega is not None:
+        return np.full(leading, omega)
+    fractions = np.linspace(0.0, 1.0, _POINTS)
+    # Away from the ends, where a part may be infinite.
+    low = np.full(leading, _MARGIN)
+    high = 1 - low
+    for _ in range(_STAGES):
+        points = low[..., None] + (high - low)[..., None] * fractions
+        best = size(points).argmin(axis=-1)
+        centre = np.take_along_axis(points, best[..., None], axis=-1)[..., 0]
+        # The next interval reaches from the neighbour on the left to that on the right.
+        step = (high - low) / (_POINTS - 1)
+        low = np.maximum(centre - step, _MARGIN)
+        high = np.minimum(centre + step, 1 - _MARGIN)
+    return np.asarray(centre)
