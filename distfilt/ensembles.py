@@ -10,6 +10,7 @@ import numpy as np
 
 from .linalg import (
     EPS,
+    broadcast_leading,
     center_ensemble,
     cholesky,
     equal_weights,
@@ -21,6 +22,7 @@ from .linalg import (
 from .validation import (
     Array,
     ArrayInput,
+    PositiveDefinite,
     PositiveInt,
     PositiveSemidefinite,
     Rng,
@@ -108,6 +110,78 @@ def sample_covariance(ensemble: Ensemble) -> Array:
     anomalies = center_ensemble(ensemble)[1]
     n = anomalies.shape[-2]
     return symmetrise(anomalies.swapaxes(-1, -2) @ anomalies / (n - 1))
+
+
+@validated
+def match_moments(
+    ensemble: Annotated[ArrayInput, "... N d"],
+    mean: Annotated[ArrayInput, "... d"],
+    cov: PositiveDefinite,
+) -> Array:
+    r"""Map an ensemble affinely to the given sample mean and covariance.
+
+    .. math:: \mathbf x_i' = \mathbf m + \mathbf A(\mathbf x_i-\bar{\mathbf x}),\qquad
+        \mathbf A = \mathbf S^{-\top}(\mathbf S^\top\mathbf P\mathbf S)^{1/2}\mathbf S^{-1},\qquad
+        \hat{\mathbf C} = \mathbf S\mathbf S^\top
+
+    A is the optimal transport between Gaussians: of all affine maps with this result it has the
+    least mean squared displacement, in units of the new standard deviations.
+
+    Parameters
+    ----------
+    ensemble : array_like, (..., N, d)
+        Members, more than d.
+    mean : array_like, (..., d)
+        The new mean.
+    cov : array_like, (..., d, d)
+        The new sample covariance, positive definite.
+
+    Notes
+    -----
+    Anomalies in units of the new standard deviations are :math:`\mathbf Q\mathbf R`, so that
+    :math:`\mathbf S=\mathbf R^\top/\sqrt{N-1}`; let :math:`\mathbf P=\mathbf K\mathbf K^\top` and
+    :math:`\mathbf K^\top\mathbf S=\mathbf U\boldsymbol\Sigma\mathbf V^\top`. Then the new
+    anomalies, :math:`\mathbf Q\mathbf R\mathbf A`, are
+    :math:`\sqrt{N-1}\,\mathbf Q\mathbf V\mathbf U^\top\mathbf K^\top`: products of orthogonal
+    matrices and one factor, in which the condition of either covariance does not appear.
+
+    Examples
+    --------
+    >>> match_moments([[0.0], [2.0]], [5.0], [[8.0]]).ravel()
+    array([3., 7.])
+    """
+    n, d = ensemble.shape[-2:]
+    if n <= d:
+        raise ValueError(
+            f"ensemble must have more than {d} members for {d} components, got {n}"
+        )
+    leading = broadcast_leading(ensemble.shape[:-2], mean.shape[:-1], "mean")
+    broadcast_leading(leading, cov.shape[:-2], "cov")
+    # Anomalies in units of the new standard deviations are Q R.
+    std = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    weights = np.full(n, 1 / n)
+    scaled = ensemble / std[..., None, :]
+    centre = weights @ scaled
+    scaled -= centre[..., None, :]
+    q, r = np.linalg.qr(scaled)
+    # The part of a component that is independent of those before it must exceed rounding.
+    length = np.sqrt((r**2).sum(axis=-2))
+    independent = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
+    rounding = 32 * d * EPS * (length + np.abs(centre))
+    if (independent <= rounding).any():
+        raise ValueError(
+            "ensemble must have components that are not constant and not combinations "
+            "of others, got a singular sample covariance"
+        )
+    # Kᵀ Rᵀ = U Σ Vᵀ, and the new anomalies are √(N-1) Q V Uᵀ Kᵀ.
+    upper = cholesky(cov / (std[..., :, None] * std[..., None, :])).mT
+    u, _, vh = np.linalg.svd(upper @ r.mT)
+    rotation = vh.mT @ (u.mT @ upper)
+    anomalies = q @ (np.sqrt(n - 1) * rotation)
+    # Q is centred to rounding only, which counts where the old ensemble is almost flat.
+    anomalies -= (weights @ anomalies)[..., None, :]
+    anomalies *= std[..., None, :]
+    return np.asarray(anomalies + mean[..., None, :])
 
 
 def exact_noise(avoid: Array, root: Array, rng: Rng) -> Array:

@@ -166,14 +166,39 @@ def broadcast_leading(
         ) from None
 
 
-def solve_lower(lower: Array, right: Array) -> Array:
-    r"""Solve L x = b, (..., d, d) and (..., d, k); leading axes broadcast."""
-    return _solve_triangular(lower, right, transposed=False)
+def solve_lower(lower: Array, right: Array, *, transposed: bool = False) -> Array:
+    r"""Solve L x = b, or Lᵀ x = b, (..., d, d) and (..., d, k); leading axes broadcast."""
+    d, k = right.shape[-2:]
+    if lower.size == d * d and lower.ndim <= right.ndim:
+        return _solve_one_factor(lower.reshape(d, d), right, transposed)
+    leading = lower.shape[:-2]
+    if leading != right.shape[:-2]:
+        leading = np.broadcast_shapes(leading, right.shape[:-2])
+        lower = np.broadcast_to(lower, (*leading, d, d))
+        right = np.broadcast_to(right, (*leading, d, k))
+    n = math.prod(leading)
+    factors = lower.reshape(n, d, d)
+    sides = right.reshape(n, d, k)
+    if n > 2 * d:
+        # Row after row of all systems at once is faster than a call for each.
+        solution = _solve_in_blocks(factors, sides, transposed)
+    else:
+        solution = np.empty((n, d, k))
+        for i in range(n):
+            if d <= _SMALL and k > 200 * d:
+                solution[i] = _solve_one_factor(factors[i], sides[i], transposed)
+            else:
+                solution[i], failed = dtrtrs(
+                    factors[i], sides[i], lower=1, trans=int(transposed)
+                )
+                if failed:
+                    raise np.linalg.LinAlgError("Singular matrix")
+    return solution.reshape(*leading, d, k)
 
 
 def solve_upper(lower: Array, right: Array) -> Array:
     r"""Solve Lᵀ x = b with the *lower* triangular factor."""
-    return _solve_triangular(lower, right, transposed=True)
+    return solve_lower(lower, right, transposed=True)
 
 
 def solve_definite(matrix: Array, right: Array) -> Array:
@@ -211,35 +236,6 @@ def _has_many_small_systems(matrix: Array, right: Array) -> bool:
     m = right.shape[-2]
     same_axes = matrix.shape[:-2] == right.shape[:-2]
     return m <= _SMALL and right.size > 600 * m and same_axes
-
-
-def _solve_triangular(lower: Array, right: Array, *, transposed: bool) -> Array:
-    d, k = right.shape[-2:]
-    if lower.size == d * d and lower.ndim <= right.ndim:
-        return _solve_one_factor(lower.reshape(d, d), right, transposed)
-    leading = lower.shape[:-2]
-    if leading != right.shape[:-2]:
-        leading = np.broadcast_shapes(leading, right.shape[:-2])
-        lower = np.broadcast_to(lower, (*leading, d, d))
-        right = np.broadcast_to(right, (*leading, d, k))
-    n = math.prod(leading)
-    factors = lower.reshape(n, d, d)
-    sides = right.reshape(n, d, k)
-    if n > 2 * d:
-        # Row after row of all systems at once is faster than a call for each.
-        solution = _solve_in_blocks(factors, sides, transposed)
-    else:
-        solution = np.empty((n, d, k))
-        for i in range(n):
-            if d <= _SMALL and k > 200 * d:
-                solution[i] = _solve_one_factor(factors[i], sides[i], transposed)
-            else:
-                solution[i], failed = dtrtrs(
-                    factors[i], sides[i], lower=1, trans=int(transposed)
-                )
-                if failed:
-                    raise np.linalg.LinAlgError("Singular matrix")
-    return solution.reshape(*leading, d, k)
 
 
 def _solve_one_factor(lower: Array, right: Array, transposed: bool) -> Array:
@@ -305,9 +301,9 @@ def whiten(lower: Array, vectors: Array) -> Array:
     if lower.shape[-3] == 1 and vectors.ndim > 1:
         # One factor for all vectors along the last leading axis.
         columns = vectors.swapaxes(-1, -2)
-        white = _solve_triangular(lower[..., 0, :, :], columns, transposed=False)
+        white = solve_lower(lower[..., 0, :, :], columns)
         return white.swapaxes(-1, -2)
-    white = _solve_triangular(lower, vectors[..., None], transposed=False)
+    white = solve_lower(lower, vectors[..., None])
     return np.asarray(white[..., 0])
 
 

@@ -215,12 +215,15 @@ def gather(
     bring_near: Callable[[Array, Array], Array],
     tangent: Callable[[], Array | None],
     fallback: Callable[[], Array],
+    half_periods: Array | None = None,
 ) -> Array:
     """Bring a function's values at N points (..., N, m) onto one branch.
 
-    Where the values lie within half a period, there is only one. Otherwise the function may be
-    linear up to wraps, as that of a compass is: then the branch continues the tangent at the
-    points' mean. If it is not, each value is brought near that of `fallback`.
+    Where the values lie within half a period, there is only one. Otherwise the branch continues
+    the tangent at the points' mean, if the function is linear up to wraps, as that of a compass
+    is, or if the tangent's values have a standard deviation of at most half a period, so that it
+    says on which side of the mean a point lies. If not, each value is brought near that of
+    `fallback`.
 
     Parameters
     ----------
@@ -229,6 +232,8 @@ def gather(
         ``bring_near(values, reference)``, on the branch of the reference.
     tangent, fallback : callable
         References (..., N, m) or (..., 1, m); a tangent may be None if there is none.
+    half_periods : ndarray, (m,), optional
+        Without them only linear functions continue their tangent.
     """
     by_first = bring_near(values, values[..., :1, :])
     high = np.fmax.reduce(by_first, axis=-2, keepdims=True)
@@ -243,8 +248,10 @@ def gather(
     if line is not None:
         by_line = bring_near(values, line)
         error = np.abs(by_line - line).max(axis=-2, keepdims=True)
-        is_linear = error <= _LINEAR * np.ptp(line, axis=-2, keepdims=True)
-        wide = np.where(is_linear, by_line, wide)
+        follows = error <= _LINEAR * np.ptp(line, axis=-2, keepdims=True)
+        if half_periods is not None:
+            follows |= line.std(axis=-2, keepdims=True) <= half_periods
+        wide = np.where(follows, by_line, wide)
     return np.where(is_wide, wide, by_first)
 
 
@@ -405,9 +412,13 @@ def warn_of_wrapped_truth(f: Any, mean: Array, truth: Array) -> None:
         # A jump by a whole turn between two times, with small errors (mod 2π) at both.
         is_turn = np.abs(np.abs(jumps) - 2 * np.pi) < 0.2
         remainder = np.abs(error - 2 * np.pi * np.round(error / (2 * np.pi)))
-        # Wild errors of another kind are not near whole turns all the time.
-        is_close = (remainder < 0.5).mean(axis=0) >= 0.9
-    found = np.argwhere(is_turn & is_close)
+        # Errors of another kind are not near whole turns nearly always, and at both times of
+        # the jump; nor is the truth or the estimate a whole turn away from one time to the next.
+        is_near = remainder < 0.5
+        is_close = is_near[:-1] & is_near[1:] & (is_near.mean(axis=0) >= 0.9)
+        steps = [np.abs(np.diff(values, axis=0)) for values in (mean, truth)]
+        is_leap = np.maximum(*steps) > np.pi
+    found = np.argwhere(is_turn & is_leap & is_close)
     if not len(found) or not needs_check(f.model, "truth"):
         return
     mark_checked(f.model, "truth")

@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from distfilt.ensembles import mean, sample_covariance
+from distfilt.ensembles import match_moments, mean, sample_covariance
 from distfilt.gaussians import (
     condition,
     intersect_gaussians,
     intersection,
     intersection_weights,
 )
-from distfilt.gaussians.single import log_density, match_moments, unscented_points
+from distfilt.gaussians.single import log_density, unscented_points
 from tests.support import NAN, generator, relative_difference, spd, without_checks
 
 SEEDS = st.integers(0, 10_000)

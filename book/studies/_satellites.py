@@ -11,7 +11,7 @@ import warnings
 from dataclasses import dataclass
 from functools import partial
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from distfilt.updates import (
     transport_map_update,
     update,
 )
+from distfilt.updates.decorator import Update, wraps_update
 
 PAPER = "grange"
 SEED = 2024
@@ -68,6 +69,7 @@ class Setup:
 
 def setup(name: str, **changes: Any) -> Setup:
     """The set-up of ``table-2`` or ``table-3``, with other values of some parameters."""
+    # A changed parameter is recorded, so that stored numbers are not used for it.
     s = scenario(PAPER, name).replace(**changes).track_reads()
     start = np.array(s["initial_state"])
     dt = s["dt_observe"]
@@ -83,12 +85,14 @@ def setup(name: str, **changes: Any) -> Setup:
             raise ValueError(
                 f"state_order must be that of satellite_pose, got {s['state_order']}"
             )
+        # Translation and attitude have priors of their own.
         moved = s["prior_offset_translation"]
         wide = s["prior_variance_translation"]
         turned = s["prior_offset_attitude"]
         loose = s["prior_variance_attitude"]
         offset = np.repeat([moved, turned], [6, 7])
         variance = np.repeat([wide, loose], [6, 7])
+    # Observation times t_1 ... t_n, without rounding errors
     n = round((s["end_time"] - s["first_observation"]) / dt) + 1
     times = np.round(s["first_observation"] + dt * np.arange(n), 10)
     return Setup(
@@ -130,14 +134,24 @@ def draw_data(
 
 
 def paper_filter(
-    s: Setup, *, pca: bool, noise_factor: float = 1.0, **changes: Any
+    s: Setup,
+    *,
+    pca: bool,
+    noise_factor: float = 1.0,
+    angles: Literal["each", "together"] = "each",
+    **changes: Any,
 ) -> EnsembleFilter:
     """Algorithm 1 of the paper, in principal components (Algorithm 2) or without.
 
     Without them the update is `enkf_sampled_covariance`, which is the affine map in
-    closed form.
+    closed form. The paper does not say how an angle wraps. With ``angles="each"`` every
+    member's prediction is brought near the observation by itself, so that each
+    innovation is the shorter way round; with ``"together"`` the library brings an
+    ensemble's predictions onto one branch first, and moves them as one.
     """
+    # q_x and q_y of the table
     options = s.pca if pca else {}
+    # Predictions with less noise than stated, for other interpretations of the text
     if noise_factor == 0:
         rule: Any = partial(noise_free_update, **options)
     elif pca:
@@ -149,7 +163,29 @@ def paper_filter(
             if full
             else partial(transport_map_update, noise_factor=noise_factor)
         )
+    if angles == "each":
+        rule = align_each(rule)
+    # The consensus step (16)
     return _make_filter(s, rule, partial(mean_pull, **(s.pull | changes)))
+
+
+def align_each(rule: Update) -> Update:
+    """Return an update that gets each prediction of an angle near the observation by itself."""
+
+    @wraps_update(rule)
+    def aligned(
+        ensemble: np.ndarray,
+        predicted: np.ndarray,
+        observed: np.ndarray,
+        noise: np.ndarray,
+        *,
+        rng: np.random.Generator,
+    ) -> np.ndarray:
+        return np.asarray(rule(ensemble, predicted, observed, noise, rng=rng))
+
+    # The tag by which a filter aligns predictions one by one, as for likelihoods
+    vars(aligned)["weights_members"] = True
+    return aligned
 
 
 @update
@@ -182,12 +218,14 @@ def noise_free_update(
     gain = np.linalg.pinv(transposed @ dh, hermitian=True, rtol=1e-12) @ (
         transposed @ dx
     )
+    # Back to the state by W, with the part outside the leading directions kept
     step = (observed[..., None, :] @ v - h) @ gain
     return np.asarray(ensemble + step @ np.swapaxes(w, -1, -2))
 
 
 def better_filter(s: Setup, kind: str) -> EnsembleFilter:
     """Return a filter of the section "Better", by its update and its fusion rule."""
+    # Least trace, each component in units of its prior deviation
     fuse = partial(
         intersect_ensembles, rule="trace", scale=np.sqrt(np.diag(s.prior[1]))
     )
@@ -231,6 +269,7 @@ def run_filter(
     scores: tuple[str, ...] = ("squared_error", "nees"),
 ) -> Any:
     """The filter on a batch of runs, as an xarray.Dataset."""
+    # Agents draw their members independently from one prior.
     begin = f.start(s.prior, rng=np.random.default_rng(seed), runs=truth.shape[1:-1])
     return f.run(begin, s.times, seen, truth=truth, scores=scores)
 
@@ -250,11 +289,13 @@ def score_runs(
     # Squared distance of the agents' means from their common mean
     deviations = late["mean"] - late["mean"].mean("agent")
     distances = (deviations**2).sum("component").mean(("time", "agent")).values
+    # NEES per component, 1 for a consistent filter
     nees = (
         late["nees"].mean(("time", "agent")).values / s.model.dim
         if "nees" in late
         else None
     )
+    # One column a run of the batch
     columns: dict[str, float] = {}
     for r in range(error.shape[0]):
         if each_agent:
@@ -299,11 +340,12 @@ def stored_steps(s: Setup) -> range:
 
 def time_columns(s: Setup, name: str) -> list[str]:
     """Return the names of the columns of `time_series`."""
-    return [f"{name}_{what}{k:03d}" for k in stored_steps(s) for what in "en"]
+    return [f"{name}_{quantity}{k:03d}" for k in stored_steps(s) for quantity in "en"]
 
 
 def step_series(s: Setup, name: str, result: Any) -> dict[str, float]:
     """Mean over a batch's runs of every agent's squared error, at all steps."""
+    # (T, A), means over the runs
     error = result["total_squared_error"].mean("run").values
     return {
         f"{name}_{a}_t{k:03d}": round_six(error[k, i])
@@ -331,6 +373,7 @@ class StudyNumbers:
 
     def each(self, name: str) -> np.ndarray:
         """One number a run, in the order of the runs, (runs,)."""
+        # Run r of batch b is number b R + r.
         batches = [self.columns[f"{name}_{r}"] for r in range(self.batch)]
         return np.stack(batches, axis=1).ravel()
 
@@ -361,6 +404,7 @@ def repeat(*scripts: ModuleType) -> None:
     warnings.filterwarnings(
         "ignore", message="A worker (stopped|was restarted) while some"
     )
+    # Chapters go on while the workers compute.
     pool = ProcessPoolExecutor(cpu_count())
     for script in scripts:
         if not script.SETUP.is_changed:
@@ -373,6 +417,7 @@ def _compare_first_batch(name: str) -> str:
     Where a script has a `part`, which gives some of a trial's numbers, those are
     compared.
     """
+    # A worker loads the script anew.
     script = studies.script(name)
     study = studies.stored(script.PAPER, script.NAME)
     if hasattr(script, "part"):
@@ -387,6 +432,7 @@ def _compare_first_batch(name: str) -> str:
             if different
             else ""
         )
+    # Without a part, the whole first batch
     names = ("rtol", "ill_conditioned")
     options = {k: getattr(script, k) for k in names if hasattr(script, k)}
     try:
@@ -402,6 +448,7 @@ def load_numbers(script: ModuleType) -> StudyNumbers:
     Nothing is stored of a scenario that a reader has changed: two trials of it run now.
     """
     if script.SETUP.is_changed:
+        # Enough to show that the cells still run
         trials = studies.run(script.trial, script.seeds[:2], workers=2)
         return StudyNumbers(trials.metrics(script.columns), script.BATCH)
     study = studies.stored(script.PAPER, script.NAME)

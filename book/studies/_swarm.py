@@ -1,7 +1,7 @@
 """A swarm's local density filters: the paper's, its variants, and flooding, on the same agents.
 
 Chapter 10 runs it live, and the stored studies of local filters run it longer: every
-scheme sees the same positions.
+scheme observes the same positions.
 """
 
 from __future__ import annotations
@@ -22,25 +22,32 @@ from distfilt.network import Faults
 sys.path.insert(0, str(Path(__file__).parent))
 import densities
 
+# The scenarios: the paper's swarm, our choices, and those for the local filters
 SWARM = densities.SWARM
 CHOICES = densities.CHOICES
 SHARING = scenario("zheng", "locals")
 LOCAL = int(SHARING["local"])
 FLAT = CHOICES["local_prior_std"]
 MODES = SHARING["modes"]
+# Gains of (16) as printed, with six and ten times b, with ten times a, and per step
 GAINS = {"alpha": SWARM["pi_alpha"], "a": SWARM["pi_proportional"]}
 PAPERS = {**GAINS, "b": SWARM["pi_integral"]}
+SIXFOLD = {**GAINS, "b": 6 * SWARM["pi_integral"]}
 FAST = {**GAINS, "b": 10 * SWARM["pi_integral"]}
 STIFF = {**PAPERS, "a": 10 * SWARM["pi_proportional"]}
 STEPS = {k: v / SWARM["dt"] for k, v in PAPERS.items()}
+# R from the observations, as printed, with a prior whose mass may change
 PRINTED = {"noise": "observed", "mass_std": SHARING["mass_std"]}
+# Half of all messages are lost
 HALF = Faults(loss=0.5, seed=3)
 SCHEMES: dict[str, tuple[Any, dict[str, Any]]] = {
+    # Observers of all agents
     "central": (density.Centralised(), {"initial_density": "observed"}),
     "central_printed": (
         density.Centralised(),
         {"initial_density": "observed", **PRINTED},
     ),
+    # The paper's rule, from the agent's own kernel or from the flat Gaussian
     "paper": (density.PIConsensus(modes=MODES, **PAPERS), {}),
     "paper_printed": (density.PIConsensus(modes=MODES, **PAPERS), PRINTED),
     "paper_flat": (density.PIConsensus(modes=MODES, initial_std=FLAT, **PAPERS), {}),
@@ -53,6 +60,7 @@ SCHEMES: dict[str, tuple[Any, dict[str, Any]]] = {
         density.PIConsensus(modes=MODES, initial_std=FLAT, **STEPS),
         PRINTED,
     ),
+    # Other rules: the first-order average, flooding, and no rule at all
     "average": (density.DynamicAverage(), {}),
     "flooding": (density.Flooding(), {}),
     "flooding_forgets": (density.Flooding(forget=SHARING["forget"]), {}),
@@ -72,7 +80,7 @@ class Case:
     neighbours for each agent.
     """
 
-    reading: str = "slowgibbs"
+    interpretation: str = "slowgibbs"
     start: str = "uniform"
     end: float = 20.0
     phase: float = 0.0
@@ -88,10 +96,12 @@ class Case:
     @property
     def bandwidth(self) -> float:
         """The scenario's; with more agents narrower, by the power that is best."""
+        # h ∝ N^(-1/6) minimises the integrated squared error in the plane.
         return float(CHOICES["bandwidth"] * (self.agents / SWARM["agents"]) ** (-1 / 6))
 
     @property
     def radio_range(self) -> float:
+        """The scenario's; with more agents shorter, for as many neighbours each."""
         return float(SWARM["radio_range"] * np.sqrt(SWARM["agents"] / self.agents))
 
 
@@ -99,9 +109,11 @@ def make_filter(
     scheme: str, case: Case, local: int | Sequence[int] = LOCAL, **options: Any
 ) -> DensityFilter:
     """Return a scheme's filter with the scenario's choices."""
-    # The filters believe in f turned by the case's phase.
+    # The filters' model has its f turned by the case's phase.
     protocol, scheme_options = SCHEMES[scheme]
-    model = density.FokkerPlanck(densities.swarm(case.reading, case.phase), case.grid)
+    law = densities.swarm(case.interpretation, case.phase)
+    model = density.FokkerPlanck(law, case.grid)
+    # The first agents have a filter each, or those that are named.
     agents = tuple(range(local)) if isinstance(local, int) else tuple(local)
     return DensityFilter(
         model,
@@ -139,11 +151,14 @@ def compare_filters(
     """
     cells = case.grid
     dt = SWARM["dt"]
-    swarm = densities.swarm(case.reading)
+    swarm = densities.swarm(case.interpretation)
+    # All filters start from the same agents.
     x, p = draw_swarm(case, rng)
     states = {s: f.start(x) for s, f in filters.items()}
     model = density.FokkerPlanck(swarm, cells)
-    wrong_model = density.FokkerPlanck(densities.swarm(case.reading, case.phase), cells)
+    wrong_model = density.FokkerPlanck(
+        densities.swarm(case.interpretation, case.phase), cells
+    )
     # Two open loops without observations: from the kernel estimate, and from a flat Gaussian
     unobserved = np.stack(
         [
@@ -172,12 +187,14 @@ def compare_filters(
         y = density.kernel_density(
             x[~(leaving & after)], cells, bandwidth=case.bandwidth
         )
+        # L2 distances from the true density, and of each observation from y
         noted = {
             "kde": cells.norm(y - p),
             "open": cells.norm(unobserved[0] - p),
             "open_flat": cells.norm(unobserved[1] - p),
         }
         for s, state in states.items():
+            # One number for each local filter
             noted[f"{s}_error"] = cells.norm(state.estimates - p)
             noted[f"{s}_consensus"] = cells.norm(state.observed - y)
         for name, value in noted.items():
@@ -189,10 +206,10 @@ def average(
     values: np.ndarray, case: Case, start: float, end: float | None = None
 ) -> np.ndarray:
     """Mean over the times from `start` to `end`."""
+    # Values a second
     k = len(values) / case.end
-    return values[round(start * k) : None if end is None else round(end * k)].mean(
-        axis=0
-    )
+    stop = None if end is None else round(end * k)
+    return values[round(start * k) : stop].mean(axis=0)
 
 
 code = (compare_filters, make_filter, draw_swarm, average)

@@ -29,7 +29,7 @@ class Team:
     noise: np.ndarray
     target_cov: np.ndarray
     ego_cov: np.ndarray
-    reading_cov: np.ndarray
+    observation_cov: np.ndarray
     faults: Faults | None = None
     gate: float | None = None
 
@@ -82,7 +82,7 @@ class Team:
                 np.zeros(len(x.T)), noise, size=runs
             )
             errors = rng.multivariate_normal(
-                np.zeros(e), self.reading_cov, size=(runs, self.size)
+                np.zeros(e), self.observation_cov, size=(runs, self.size)
             )
             truth.append(x[:, :n])
             seen.append((h @ x[:, None, :, None])[..., 0] + errors)
@@ -114,12 +114,12 @@ class Team:
             before = mean @ move.T, move @ cov @ move.T + noise
             # Each agent conditions on its own observation, then on the messages that arrive.
             after = condition(
-                *before, self.sees(0, 1), self.reading_cov, seen[k], self.gate
+                *before, self.sees(0, 1), self.observation_cov, seen[k], self.gate
             )
             mean, cov = after
             if way != "alone":
                 exchange = {
-                    "news": exchange_increments,
+                    "increments": exchange_increments,
                     "intersection": intersect_beliefs,
                 }[way]
                 mean, cov = exchange(before, after, self.arrivals(k, runs), n)
@@ -139,7 +139,7 @@ class Team:
                 Sensor(
                     len(h),
                     lambda x, h=h: x @ h.T,
-                    self.reading_cov,
+                    self.observation_cov,
                     linear=lambda d, h=h: h,
                 )
             )

@@ -18,7 +18,9 @@ from distfilt.mixtures import (
 NAME = "arcs"
 PAPER = "semeraro"
 
+# Points of each importance sample
 MEMBERS = 4000
+# Terms and rule for weights of each approximation
 RULES = {
     "c1": ("all", "C1"),
     "c2": ("all", "C2"),
@@ -26,6 +28,7 @@ RULES = {
     "matched": ("matched", "C3"),
     "points": ("matched", "points"),
 }
+# Every number of a pair is uniform between these; lengths have no unit.
 BOUNDS = {
     "mixands": (3, 6),
     "distance": (6.0, 12.0),
@@ -76,6 +79,7 @@ def arc(
     slope[:, 2:, 3] = v
     # The target lies at range r; the ego is shifted the other way by half.
     means = np.concatenate([agent + r * u, agent - 0.5 * r * (u + agent / r)], axis=-1)
+    # Weights are those of a standard normal at the offsets s_k.
     w = np.exp(-0.5 * s**2)
     covs = (slope * variances) @ slope.mT
     return GaussianMixture(w / w.sum(), means, 0.5 * (covs + covs.mT))
@@ -86,15 +90,22 @@ def draw_belief(
     rng: np.random.Generator,
     *,
     mixands: tuple[int, int] = BOUNDS["mixands"],
+    width: float | None = None,
 ) -> GaussianMixture:
-    """Draw one agent's belief within the bounds; its arc misses the origin a little."""
+    """Draw one agent's belief within the bounds; its arc misses the origin a little.
+
+    A `width` that is passed replaces the drawn one.
+    """
     draws = {
         name: rng.uniform(*BOUNDS[name])
         for name in ("distance", "angle_std", "range_std", "ego_std", "width")
     }
+    if width is not None:
+        draws["width"] = width
     r = draws.pop("distance")
     place = r * np.array([np.cos(bearing), np.sin(bearing)])
     bent = arc(int(rng.integers(mixands[0], mixands[1] + 1)), place, **draws)
+    # Both positions move alike, so that the relative position stays an arc.
     shift = np.tile(rng.normal(scale=0.3, size=2), 2)
     return GaussianMixture(bent.weights, bent.means + shift, bent.covs)
 
@@ -108,11 +119,10 @@ def mix(a: GaussianMixture, b: GaussianMixture, share: float) -> GaussianMixture
     )
 
 
-def trial(seed: np.random.SeedSequence) -> dict[str, float]:
+def score_rules(
+    first_belief: GaussianMixture, second_belief: GaussianMixture, first_seed: int
+) -> dict[str, float]:
     """Return Jeffreys' divergences of both agents and of the targets, for each rule and for CI."""
-    for_pair, for_points = (np.random.default_rng(s) for s in seed.spawn(2))
-    first_belief = draw_belief(np.pi, for_pair)
-    second_belief = draw_belief(np.pi + for_pair.uniform(*BOUNDS["turn"]), for_pair)
     # Each agent receives the other's marginal of the target.
     fusions = [
         PartialFusion(first_belief, second_belief.marginal([0, 1])),
@@ -128,11 +138,11 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     fused["moments"] = [
         fuse_moments(fusion.prior, fusion.received) for fusion in fusions
     ]
-    # All rules are compared on the same points.
-    first_seed = int(for_points.integers(2**31))
     columns = {}
     for name, pair in fused.items():
         for k, (fusion, mixture) in enumerate(zip(fusions, pair, strict=True)):
+            # Each agent's approximation against its exact fused density; all rules are
+            # compared on points of the same seeds.
             divergence = jeffreys_by_sampling(
                 mixture.log_density,
                 fusion.log_value,
@@ -141,6 +151,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
                 rng=np.random.default_rng(first_seed + k),
             )
             columns[f"{name}_{k + 1}"] = divergence.value
+        # Exact fusion gives both agents the same target: this divergence should be zero.
         a, b = (mixture.marginal([0, 1]) for mixture in pair)
         divergence = jeffreys_by_sampling(
             a.log_density,
@@ -153,9 +164,17 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     return columns
 
 
+def trial(seed: np.random.SeedSequence) -> dict[str, float]:
+    """Draw a pair of beliefs and score all rules on it."""
+    for_pair, for_points = (np.random.default_rng(s) for s in seed.spawn(2))
+    first_belief = draw_belief(np.pi, for_pair)
+    second_belief = draw_belief(np.pi + for_pair.uniform(*BOUNDS["turn"]), for_pair)
+    return score_rules(first_belief, second_belief, int(for_points.integers(2**31)))
+
+
 parameters = {"members": MEMBERS, "bounds": BOUNDS, "rules": RULES}
 columns = tuple(f"{m}_{k}" for m in (*RULES, "moments") for k in (1, 2, "target"))
-code = (draw_belief, mix)
+code = (draw_belief, mix, score_rules)
 seeds = np.random.SeedSequence(20260).spawn(300)
 rtol = 1e-4
 atol = 1e-12

@@ -1,8 +1,10 @@
 """Centralised density filters of Zheng and Lin beside a kernel estimate, open loops and a bound.
 
 One trial runs both interpretations of (23), from a uniform and from a peaked density,
-with the exact model and with one whose f is out of phase, and averages L2 errors from
-20 s on. All filters of a case see the same agents.
+with the exact model and with one whose f is out of phase. From 20 s on it averages two
+errors: the L2 distance from the density of infinitely many agents, and the RMS error of
+the number of agents in the blocks of a chessboard. All filters of a case observe the
+same agents.
 """
 
 from __future__ import annotations
@@ -24,20 +26,22 @@ CHOICES = scenario("zheng", "figure-1")
 parameters = {k: s.parameter(k).value for s in (SWARM, CHOICES) for k in s}
 seeds = spawn(CHOICES["seed"], CHOICES["runs"])
 rtol = 1e-4
-READINGS = tuple(CHOICES["readings"])
+INTERPRETATIONS = tuple(CHOICES["interpretations"])
 STARTS = ("uniform", "peaked")
+# Estimates with the exact model, and those with a wrong one
 EXACT = ("kde", "filter", "observed_r", "open", "open_flat", "bound")
 WRONG = ("kde", "filter", "process", "open")
+SCORES = ("filter_nees", "bound_nees", "filter_crps", "bound_crps")
+# Blocks along a side of the room, in which agents are counted, and who counts them
+BLOCKS = (3, 6, 15)
+COUNTERS = (*EXACT, "truth")
+COUNTS = tuple(f"{e}_count_{b}" for e, b in product(COUNTERS, BLOCKS))
 columns = [
-    *(f"{r}_{s}_{e}" for r, s, e in product(READINGS, STARTS, EXACT)),
-    *(
-        f"{r}_{s}_{e}"
-        for r, s, e in product(
-            READINGS, STARTS, ("filter_nees", "bound_nees", "filter_crps", "bound_crps")
-        )
-    ),
-    *(f"{r}_wrong_{e}" for r, e in product(READINGS, WRONG)),
+    f"{r}_{s}_{e}"
+    for kinds in (EXACT, SCORES, COUNTS)
+    for r, s, e in product(INTERPRETATIONS, STARTS, kinds)
 ]
+columns += [f"{r}_wrong_{e}" for r, e in product(INTERPRETATIONS, WRONG)]
 
 
 def grid() -> density.Grid:
@@ -45,8 +49,9 @@ def grid() -> density.Grid:
     return density.Grid(tuple(int(n) for n in SWARM["cells"]))
 
 
-def swarm(reading: str, phase: float = 0.0) -> Any:
+def swarm(interpretation: str, phase: float = 0.0) -> Any:
     """Return the swarm of (23) in one interpretation, its f turned by `phase`."""
+    # The two components are opposite each other; the first one's phase fixes both.
     phases = SWARM["target_phases"]
     mixture = RotatingMixture(
         centre=SWARM["target_centre"],
@@ -56,7 +61,7 @@ def swarm(reading: str, phase: float = 0.0) -> Any:
         components=len(phases),
         phase=phases[0] + phase,
     )
-    return rotating_swarm(reading, strength=SWARM["diffusion"], mixture=mixture)
+    return rotating_swarm(interpretation, strength=SWARM["diffusion"], mixture=mixture)
 
 
 def first_density(start: str) -> np.ndarray:
@@ -64,8 +69,9 @@ def first_density(start: str) -> np.ndarray:
     cells = grid()
     if start == "uniform":
         return np.ones(cells.size)
-    gap = ((cells.centres - CHOICES["peak_centre"]) ** 2).sum(axis=-1)
-    peak = np.exp(-0.5 * gap / CHOICES["peak_variance"])
+    squares = ((cells.centres - CHOICES["peak_centre"]) ** 2).sum(axis=-1)
+    peak = np.exp(-0.5 * squares / CHOICES["peak_variance"])
+    # A floor under the peak, so that some agents start anywhere
     return cells.normalize(peak + CHOICES["peak_floor"])
 
 
@@ -85,9 +91,10 @@ def estimate_from_positions(basis: np.ndarray, positions: np.ndarray) -> Any:
     then with that estimate.
     """
     cells = grid()
-    level = np.ones(grid().size)
+    level = np.ones(cells.size)
     for _ in range(2):
         state = density.low_rank_start(basis, np.ones((1, cells.size)))
+        # R = p / (N cell), the variance of a multinomial share over the cell's size
         noise = np.maximum(level, CHOICES["floor"]) / (len(positions) * cells.volume)
         state = density.low_rank_step(state, cells.histogram(positions), noise, 1.0)
         level = state.estimates[0]
@@ -111,13 +118,28 @@ def flat_gaussian(position: np.ndarray) -> np.ndarray:
     return cells.normalize(np.exp(-0.5 * squares / CHOICES["local_prior_std"] ** 2))
 
 
-def choice(key: str, reading: str) -> Any:
+def choice(key: str, interpretation: str) -> Any:
     """Return a choice of the scenario that depends on the interpretation of (23)."""
-    return dict(zip(READINGS, CHOICES[key], strict=True))[reading]
+    return dict(zip(INTERPRETATIONS, CHOICES[key], strict=True))[interpretation]
+
+
+def count_errors(
+    cells: density.Grid, densities: np.ndarray, positions: np.ndarray, blocks: int
+) -> np.ndarray:
+    """Return the RMS error of the number of agents in a block, by density, (A,).
+
+    The room has `blocks` blocks along each side. A density predicts N times its mass.
+    """
+    width = cells.shape[0] // blocks
+    differences = np.atleast_2d(densities) - cells.histogram(positions)
+    # (A, block, cell in it, block, cell in it): the mass of each block
+    split = differences.reshape(-1, blocks, width, blocks, width)
+    masses = split.sum(axis=(2, 4)) * cells.volume
+    return len(positions) * np.sqrt((masses**2).mean(axis=(1, 2)))
 
 
 def run_case(
-    reading: str,
+    interpretation: str,
     start: str,
     rng: np.random.Generator,
     *,
@@ -125,27 +147,29 @@ def run_case(
     agents: int | None = None,
     end: float | None = None,
 ) -> dict[str, np.ndarray]:
-    """Return L2 errors over time by method, (T,), and NEES and CRPS per cell of two of them."""
+    """Return L2 errors, scores and errors of counts over time by method, (T,)."""
     cells = grid()
     dt = SWARM["dt"]
     n = int(SWARM["agents"]) if agents is None else agents
     h = CHOICES["bandwidth"]
     floor = CHOICES["floor"]
-    end = choice("end_times", reading) if end is None else end
-    true = swarm(reading)
+    end = choice("end_times", interpretation) if end is None else end
+    # The agents' law, and the filters' model of it
+    true = swarm(interpretation)
     truth = density.FokkerPlanck(true, cells)
-    model = density.FokkerPlanck(swarm(reading, phase), cells)
+    model = density.FokkerPlanck(swarm(interpretation, phase), cells)
     k = density.kernel_constant(cells, bandwidth=h, agents=n)
     basis = prior_basis()
     x = first_agents(start, n, rng)
     p = first_density(start)
     y = density.kernel_density(x, cells, bandwidth=h)
+    # Rows: the filter, R as printed, and the open loops from both starts
     base = np.stack([y, y, y, flat_gaussian(x[0])])
     filters = initial_filters(basis, base, x)
     # One more filter of lower rank, with process noise where the model is wrong
     few = basis[:, : CHOICES["low_rank"]]
     low = density.low_rank_start(few, y[None])
-    process = choice("process_scale", reading) * few
+    process = choice("process_scale", interpretation) * few
     rows = []
     noise = np.full(filters.base.shape, np.inf)
     for j in range(round(end / dt)):
@@ -156,7 +180,7 @@ def run_case(
         p = truth.step(p, t, dt)
         y = density.kernel_density(x, cells, bandwidth=h)
         filters = density.low_rank_predict(filters, move)
-        # R from the forecast, and R from the observed density; the others stay open (R = ∞).
+        # R from the forecast, and R from the kernel estimate; the others stay open (R = ∞).
         noise[0] = k * np.maximum(filters.estimates[0], floor)
         noise[1] = k * np.maximum(y, floor)
         filters = density.low_rank_step(filters, y, noise, dt)
@@ -166,21 +190,28 @@ def run_case(
             low = density.low_rank_step(low, y, low_noise, dt)
         estimates = np.stack([y, *filters.estimates, *low.estimates])
         errors = cells.norm(estimates - p)
-        rows.append(np.concatenate([errors, filter_scores(filters, p, j)]))
-    scores = ("filter_nees", "bound_nees", "filter_crps", "bound_crps")
-    names = (*EXACT, "process", *scores)
+        # Counts by all estimates with the exact model, and by the true density
+        counters = np.concatenate([estimates[: len(EXACT)], p[None]])
+        counts = [count_errors(cells, counters, x, b) for b in BLOCKS]
+        rows.append(
+            np.concatenate(
+                [errors, filter_scores(filters, p, j), np.transpose(counts).ravel()]
+            )
+        )
+    names = (*EXACT, "process", *SCORES, *COUNTS)
     return dict(zip(names, np.array(rows).T, strict=True))
 
 
 def initial_filters(basis: np.ndarray, base: np.ndarray, positions: np.ndarray) -> Any:
-    """Return filters that start from the rows of `base`; the last one, the bound, is informed."""
-    informed = estimate_from_positions(basis, positions)
+    """Return filters that start from the rows of `base`; the last one is the one look."""
+    one_look = estimate_from_positions(basis, positions)
     state = density.low_rank_start(basis, base)
+    # One more row of the same basis
     return density.LowRank(
         basis,
-        np.concatenate([base, informed.base]),
-        np.concatenate([state.information, informed.information]),
-        np.concatenate([state.vector, informed.vector]),
+        np.concatenate([base, one_look.base]),
+        np.concatenate([state.information, one_look.information]),
+        np.concatenate([state.vector, one_look.vector]),
     )
 
 
@@ -190,8 +221,10 @@ def filter_scores(filters: Any, p: np.ndarray, step: int) -> np.ndarray:
         return np.full(4, np.nan)
     from distfilt.metrics import gaussian_crps
 
+    # The filter is the first row, the one look the last.
     gap = (filters.estimates - p)[[0, -1]]
     variance = np.maximum(filters.variances[[0, -1]], 1e-12)
+    # Means over the cells
     nees = (gap**2 / variance).mean(axis=-1)
     crps = gaussian_crps(0 * gap, np.sqrt(variance), gap).mean(axis=-1)
     return np.concatenate([nees, crps])
@@ -205,18 +238,22 @@ def late_mean(values: np.ndarray) -> float:
 def trial(seed: np.random.SeedSequence) -> list[float]:
     """One run of all cases: time-averaged errors in the order of `columns`."""
     means: dict[str, float] = {}
-    cases = [(r, s) for r in READINGS for s in (*STARTS, "wrong")]
-    for (reading, start), part in zip(cases, seed.spawn(len(cases)), strict=True):
+    cases = list(product(INTERPRETATIONS, (*STARTS, "wrong")))
+    for (interpretation, start), part in zip(
+        cases, seed.spawn(len(cases)), strict=True
+    ):
+        # A wrong model is tried from the peaked start.
         wrong = start == "wrong"
         result = run_case(
-            reading,
+            interpretation,
             "peaked" if wrong else start,
             np.random.default_rng(part),
             phase=CHOICES["wrong_phase"] if wrong else 0.0,
             end=CHOICES["wrong_end"] if wrong else None,
         )
         means |= {
-            f"{reading}_{start}_{name}": late_mean(v) for name, v in result.items()
+            f"{interpretation}_{start}_{name}": late_mean(v)
+            for name, v in result.items()
         }
     return [means[c] for c in columns]
 
@@ -230,5 +267,6 @@ code: tuple[Any, ...] = (
     filter_scores,
     first_agents,
     first_density,
+    count_errors,
     late_mean,
 )

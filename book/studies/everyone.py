@@ -30,9 +30,12 @@ rtol = 1e-4
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One run: every agent's error, averaged over time."""
+    # A filter for each of the hundred agents, and the observer's
     filters = {s: swarm.make_filter(s, CASE, CASE.agents) for s in ("central", *RULES)}
+    # Errors at every fifth step are enough for means over forty seconds.
     run, _ = swarm.compare_filters(CASE, np.random.default_rng(seed), filters, every=5)
     late = {k: swarm.average(v, CASE, CHOICES["average_from"]) for k, v in run.items()}
+    # One column for each agent and rule
     errors = {"kde": late["kde"], "central": late["central_error"][0]}
     for s in RULES:
         errors |= {f"{s}_{i}": v for i, v in enumerate(late[f"{s}_error"])}

@@ -18,6 +18,7 @@ import _satellites as satellites
 NAME = "figure-1"
 PAPER = "grange"
 BATCH = 5
+# The paper says "low-sample sizes" and prints none.
 FEW = 13
 SETUP = satellites.setup("table-2")
 NAMES = {"bare": False, "pca": True}
@@ -39,14 +40,17 @@ rtol = 1e-4
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """A batch of runs of both versions, on the same data."""
+    # Both versions have the same data; each has draws of its own.
     for_data, for_filters = seed.spawn(2)
     truth, seen = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
     values: dict[str, float] = {}
     for name, pca in NAMES.items():
         f = satellites.paper_filter(SETUP, pca=pca)
+        # The 200 members of the figure
         result = satellites.run_filter(SETUP, f, for_filters, truth, seen)
         values |= satellites.score_runs(SETUP, name, result)
         values |= satellites.step_series(SETUP, name, result)
+        # Means over the agents, and NEES per component of the state
         error = result["total_squared_error"].mean("agent").values
         nees = result["nees"].mean("agent").values / SETUP.model.dim
         values |= satellites.time_series(name, error, nees)
@@ -59,4 +63,9 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     return values
 
 
-code = (satellites.draw_data, satellites.paper_filter, satellites.score_runs)
+code = (
+    satellites.draw_data,
+    satellites.paper_filter,
+    satellites.align_each,
+    satellites.score_runs,
+)

@@ -18,6 +18,7 @@ NAME = "figure-2"
 PAPER = "grange"
 BATCH = 4
 SETUP = satellites.setup("table-3")
+# The paper prints no gain; the scenario has the one of our figure.
 GAINS = {"pca": SETUP.pull["gain"], "alone": 0.0}
 columns = [
     c
@@ -36,10 +37,12 @@ rtol = 1e-3
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """A batch of runs with both gains, on the same data."""
+    # Both gains have the same data; each filter has draws of its own.
     for_data, for_filters = seed.spawn(2)
     truth, seen = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
     values: dict[str, float] = {}
     for name, gain in GAINS.items():
+        # Gain 0 is the null of the claim: no consensus at all.
         f = satellites.paper_filter(SETUP, pca=True, gain=gain)
         result = satellites.run_filter(SETUP, f, for_filters, truth, seen)
         values |= satellites.score_runs(SETUP, name, result)
@@ -51,6 +54,7 @@ def part(seed: np.random.SeedSequence) -> dict[str, float]:
     """The paper's filter with the pull, as in the trial, for chapter 4 to run again."""
     for_data, for_filters = seed.spawn(2)
     truth, seen = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    # The pull comes first in the trial, so its draws are the same.
     f = satellites.paper_filter(SETUP, pca=True, gain=GAINS["pca"])
     result = satellites.run_filter(SETUP, f, for_filters, truth, seen)
     return satellites.score_runs(SETUP, "pca", result) | satellites.step_series(

@@ -1,9 +1,8 @@
 """Interpretations of the consensus of Zheng and Lin, and Fig. 1 under each of them.
 
-Gains per second or per step, a larger integral gain, where consensus starts, R as
-printed with a prior whose mass may change, and the widths that the paper does not give:
-of the flat Gaussian and of the kernel. Slow interpretation of (23), uniform start, 60
-s.
+Gains per second or per step, where consensus starts, R as printed with a prior whose
+mass may change, and the widths that the paper does not give: of the flat Gaussian and
+of the kernel. Slow interpretation of (23), uniform start, 60 s.
 """
 
 from __future__ import annotations
@@ -26,15 +25,17 @@ NAME = "gains"
 PAPER = "zheng"
 CHOICES = swarm.CHOICES
 CASE = figure.CASE
+# Widths of the flat Gaussian and of the kernel beside the scenario's .3 and .08
 WIDE = 1.0
 KERNELS = {"narrow": 0.05, "broad": 0.12}
-READINGS = (
+INTERPRETATIONS = (
+    # Gains per second: from the own kernel, and from the flat Gaussian
     "paper",
     "paper_flat",
-    "fast",
-    "fast_flat",
+    # Gains per step of 0.1 s
     "steps_flat",
     "steps_printed",
+    # Other widths
     "paper_wide",
     "paper_narrow",
     "paper_broad",
@@ -45,7 +46,7 @@ columns = [
     "kde",
     *CENTRALS,
     *(f"{s}_below" for s in CENTRALS),
-    *(f"{r}_{k}" for r in READINGS for k in KINDS),
+    *(f"{r}_{k}" for r in INTERPRETATIONS for k in KINDS),
 ]
 parameters = {
     "seed": CHOICES["seed"],
@@ -59,9 +60,9 @@ scenarios = swarm.scenarios
 rtol = 1e-4
 
 
-def own_central(reading: str) -> str:
+def own_central(interpretation: str) -> str:
     """Return the centralised filter of the same R and kernel, for comparison."""
-    name = f"central_{reading.split('_')[-1]}"
+    name = f"central_{interpretation.split('_')[-1]}"
     return name if name in CENTRALS else "central"
 
 
@@ -72,6 +73,7 @@ def network(scheme: str) -> DensityFilter:
         f = swarm.make_filter("paper_flat" if base == "paper" else base, CASE)
         return replace(f, bandwidth=KERNELS[last])
     if last == "wide":
+        # The filter and the consensus start from the same Gaussian.
         f = swarm.make_filter("paper_flat", CASE)
         return replace(f, initial_std=WIDE, fusion=replace(f.fusion, initial_std=WIDE))
     return swarm.make_filter(scheme, CASE)
@@ -79,8 +81,9 @@ def network(scheme: str) -> DensityFilter:
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One run: per interpretation the statements of the caption, each from eight local filters."""
-    filters = {s: network(s) for s in (*CENTRALS, *READINGS)}
+    filters = {s: network(s) for s in (*CENTRALS, *INTERPRETATIONS)}
     run, _ = swarm.compare_filters(CASE, np.random.default_rng(seed), filters)
+    # The second half of the minute
     half = CASE.end / 2
     # A twelfth of the run: five seconds
     k = len(run["kde"]) // 12
@@ -90,7 +93,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     for s in CENTRALS:
         values[s] = swarm.average(run[f"{s}_error"], CASE, half)[0]
         values[f"{s}_below"] = figure.below(run[f"{s}_error"][:, 0], level)
-    for r in READINGS:
+    for r in INTERPRETATIONS:
         error = run[f"{r}_error"]
         # Over the centralised filter with the same R and kernel
         ratio = mean_interval(swarm.average(error, CASE, half) / values[own_central(r)])

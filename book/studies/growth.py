@@ -23,27 +23,25 @@ PAPER = "zheng"
 CHOICES = swarm.CHOICES
 SIZES = (50, 100, 300, 1000, 3000, 10_000)
 GRIDS = (15, 30, 60)
+# Seconds, of which the last two are averaged
 END = 6.0
 FROM = 4.0
-SIXTEEN = 16
-TABLES = 3000
+# Local filters, and the largest swarm that floods
+N_LOCAL = 16
+LARGEST_FLOODING = 3000
 RULES = ("central", "paper", "average", "flooding")
-TOLD = ("consensus", "numbers")
-columns = [
-    *(
-        f"{kind}_{n}_{k}"
-        for kind, sizes in (("agents", SIZES), ("cells", GRIDS))
-        for n in sizes
-        for k in (
-            "kde",
-            "open",
-            *RULES,
-            *(f"{r}_{k}" for r in RULES[1:] for k in TOLD),
-            "connected",
-        )
-    ),
-]
-parameters = {"seed": CHOICES["seed"], "end": END, "local": SIXTEEN}
+# Of each rule of consensus: its error, and the numbers that an agent sends in a step
+CONSENSUS_KINDS = ("consensus", "numbers")
+KINDS = (
+    "kde",
+    "open",
+    *RULES,
+    *(f"{rule}_{kind}" for rule in RULES[1:] for kind in CONSENSUS_KINDS),
+    "connected",
+)
+columns = [f"agents_{n}_{kind}" for n in SIZES for kind in KINDS]
+columns += [f"cells_{n}_{kind}" for n in GRIDS for kind in KINDS]
+parameters = {"seed": CHOICES["seed"], "end": END, "local": N_LOCAL}
 seeds = spawn(CHOICES["seed"] + 3, 3)
 scenarios = swarm.scenarios
 rtol = 1e-4
@@ -51,13 +49,14 @@ rtol = 1e-4
 
 def run_swarm(case: swarm.Case, rng: np.random.Generator) -> dict[str, float]:
     """Errors by rule, averaged over time, of one swarm; numbers sent by an agent in a step."""
-    names = [s for s in RULES if s != "flooding" or case.agents <= TABLES]
-    filters = {s: swarm.make_filter(s, case, min(SIXTEEN, case.agents)) for s in names}
+    names = [s for s in RULES if s != "flooding" or case.agents <= LARGEST_FLOODING]
+    filters = {s: swarm.make_filter(s, case, min(N_LOCAL, case.agents)) for s in names}
     connected: list[bool] = []
 
     def watch(
         t: float, x: np.ndarray, p: np.ndarray, states: dict[str, object]
     ) -> None:
+        # The graph of this step is in one part.
         connected.append(states["paper"].parts == 1)
 
     run, ends = swarm.compare_filters(case, rng, filters, watch, every=10)
@@ -68,6 +67,7 @@ def run_swarm(case: swarm.Case, rng: np.random.Generator) -> dict[str, float]:
         "open": late["open"],
         "connected": float(np.mean(connected)),
     }
+    # NaN for flooding in the largest swarm
     values |= {s: late.get(f"{s}_error", np.nan) for s in RULES}
     # Numbers sent by one agent in one step
     steps = case.agents * END / swarm.SWARM["dt"]
@@ -84,10 +84,12 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """Every size once, and every grid."""
     values: dict[str, float] = {}
     draws = iter(seed.spawn(len(SIZES) + 1))
+    # Every size has agents of its own.
     for n in SIZES:
         case = swarm.Case(start="peaked", end=END, agents=n)
         part = run_swarm(case, np.random.default_rng(next(draws)))
         values |= {f"agents_{n}_{k}": v for k, v in part.items()}
+    # All grids have the same agents.
     same = next(draws)
     for n in GRIDS:
         case = swarm.Case(start="peaked", end=END, cells=(n, n))

@@ -32,8 +32,10 @@ from distfilt.sensors import Sensor, angles_only, ephemeris, stack
 
 NAME = "orbit"
 PAPER = "semeraro"
+# Table 3 of the paper, with the assumptions of the scenario
 TABLE = scenario("semeraro", "table-3").track_reads()
 HOURS = tuple(int(h) for h in TABLE["hours"])
+# Epochs before the ephemeris of 22 h
 EARLY = [k for k, hour in enumerate(HOURS) if hour < TABLE["fix_at"]]
 ARCSECOND = np.pi / 180 / 3600
 
@@ -47,6 +49,7 @@ def rotate_state(state: np.ndarray, degrees: float) -> list[float]:
     """Return position and velocity turned about the Earth's axis."""
     c = np.cos(np.radians(degrees))
     s = np.sin(np.radians(degrees))
+    # Position and velocity turn by the same matrix, since the frame is inertial.
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     rotated = state.reshape(2, 3) @ turn.T
     return [float(v) for v in rotated.ravel()]
@@ -69,6 +72,7 @@ SETTING = {
     "one_fix": True,
     "widen": 1.0,
 }
+# A wider prior and no observation for many hours: beliefs bend.
 LATE = {
     **SETTING,
     "first_angle": TABLE["late_first_angle"],
@@ -77,6 +81,7 @@ LATE = {
 }
 MORE_AGENTS = [rotate_state(TABLE["agent_1"], d) for d in TABLE["more_agents"]]
 CROWD = PAIR + MORE_AGENTS
+# Agent 1 with the sign that Table 3 prints
 MIRRORED = [-PAIR[0][0], *PAIR[0][1:]]
 SCENES = {
     "": SETTING,
@@ -95,6 +100,7 @@ SCENES = {
 def fuse_reduced(own: GaussianMixture, received: Beliefs) -> GaussianMixture:
     """Fuse matched terms with C2, received mixtures reduced to six components for the shapes."""
     fusion = PartialFusion(own, received)
+    # The weights use the whole mixtures; only the shapes come from the reduced ones.
     reduced = [runnalls(mixture, 6) for mixture in received]
     shapes = fusion.component_shapes(received=reduced)
     return fusion.assign_weights(shapes, rule="C2")
@@ -105,7 +111,9 @@ def average_pair(own: GaussianMixture, received: Beliefs) -> GaussianMixture:
     return average_mixtures(own, received[0])
 
 
+# Kilometres that a kilometre or a metre per second counts as
 SCALE = [1.0, 1.0, 1.0, 6.8, 6.8, 6.8]
+# Mixtures: a component is split where its forecast is stretched beyond the threshold.
 MANY = {
     "split_threshold": TABLE["stretch"],
     "split_scale": np.tile(SCALE, 2),
@@ -118,6 +126,7 @@ MORE = {
     "max_components": TABLE["late_mixands"],
 }
 ONE = {"n_components": 1, "max_components": 1}
+# Rules for more than two agents: received mixtures are fused one after the other.
 PAIRWISE = partial(fuse_mixtures, n_components=TABLE["mixands"])
 SEQUENTIAL = partial(fuse_sequentially, pair=PAIRWISE)
 EQUAL_MOMENTS = partial(fuse_moments, omega="equal")
@@ -125,9 +134,9 @@ HALF_MOMENTS = partial(fuse_sequentially, pair=fuse_moments, omega=0.5)
 SINGLE = {
     "one_none": ONE,
     "one_ci": {**ONE, "fusion": EQUAL_MOMENTS},
-    "news": {"news": True},
+    "increments": {"increments": True},
 }
-"""Filters of one Gaussian; ``news`` stands for information increments, as in the columns."""
+"""Filters of one Gaussian."""
 CROWDED = {
     "none": MANY,
     "turn": {**MANY, "fusion": SEQUENTIAL},
@@ -137,13 +146,15 @@ CROWDED = {
 ROWS = {
     "": {
         "none": MANY,
+        # Weights by C2 or by C3 on matched terms, by C3 on all terms
         "c2": {**MANY, "fusion": partial(fuse_mixtures, rule="C2")},
         "c3": {**MANY, "fusion": fuse_mixtures},
         "all": {**MANY, "fusion": partial(fuse_mixtures, terms="all")},
         "moments": {**MANY, "fusion": fuse_moments},
         "average": {**MANY, "fusion": average_pair},
         **SINGLE,
-        "twice": {"news": True, "shared_components": ()},
+        # The ephemeris is sent as an increment, although both agents have it.
+        "twice": {"increments": True, "shared_components": ()},
     },
     "late": {
         "none": MORE,
@@ -151,10 +162,11 @@ ROWS = {
         "c3": {**MORE, "fusion": fuse_mixtures},
         "moments": {**MORE, "fusion": fuse_moments},
         **SINGLE,
-        "many_news": {**MORE, "news": True},
+        "many_increments": {**MORE, "increments": True},
     },
     "three": {
         **CROWDED,
+        # All beliefs in one pass, with equal exponents
         "pass": {**MANY, "fusion": partial(fuse_mixtures, omega="equal")},
     },
     "five": CROWDED,
@@ -175,6 +187,7 @@ def joint_rows(scene: str) -> dict:
 
 def target_and_ego(agent: int) -> list[int]:
     """Return the components of [target; one ego] in [target; all egos]; egos count from 0."""
+    # Six components a body, the target first
     first = 6 + 6 * agent
     return list(range(6)) + list(range(first, first + 6))
 
@@ -204,6 +217,7 @@ def simulate(s: dict, rng: np.random.Generator) -> tuple:
     errors = []
     for k, body in enumerate(bodies):
         std = np.array(s["agent_std"])
+        # The target comes first; its deviations are those of Table 3, widened or not.
         if k == 0:
             std = np.array(s["target_std"]) * s["widen"]
         # Deviations are given along the radial, transverse and normal directions.
@@ -211,6 +225,7 @@ def simulate(s: dict, rng: np.random.Generator) -> tuple:
         covs.append(root @ root.T)
         errors.append(root @ rng.standard_normal(6))
     prior_mean = (bodies + errors).ravel()
+    # One trajectory of all bodies, with process noise between the epochs
     model = orbit_model(s, len(bodies))
     states = []
     x = bodies.ravel()
@@ -229,6 +244,7 @@ def observe(s: dict, truth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     observed = np.full((len(HOURS), n_agents, 8), np.nan)
     std = s["angle_std"] * ARCSECOND
     sensor = angles_only(std=std, form=s["form"])
+    # All noise of an epoch is drawn, also of observations that are then missing.
     for k, hour in enumerate(HOURS):
         noise = rng.standard_normal((n_agents, 6)) * np.repeat(s["fix_std"], 3)
         for a in range(n_agents):
@@ -272,7 +288,7 @@ def make_filter(s: dict, options: dict) -> MixtureFilter:
     n = len(s["agents"])
     chosen = dict(options)
     kind = MixtureFilter
-    if chosen.pop("news", False):
+    if chosen.pop("increments", False):
         kind = InformationIncrementFilter
         # One ephemeris is the same observation for all agents.
         shared = range(2, 8) if s["one_fix"] else ()
@@ -298,6 +314,7 @@ def run_filter(
     covs: list[np.ndarray],
 ) -> list[MixtureState]:
     """Return the states of a row's filter, one an epoch."""
+    # One step forecasts to an epoch, conditions, and exchanges one message.
     f = make_filter(s, options)
     state = f.start(prior_beliefs(prior_mean, covs))
     states = []
@@ -317,6 +334,7 @@ def run_joint(
     """Run one joint filter of all bodies and observations; return the agents' marginals."""
     n = len(s["agents"])
     std = s["angle_std"] * ARCSECOND
+    # Agent a's state follows the target's and those of the agents before it.
     angles = [
         angles_only(observer=6 * a, std=std, form=s["form"]) for a in range(1, n + 1)
     ]
@@ -329,6 +347,7 @@ def run_joint(
     state = f.start([prior])
     beliefs = []
     for k, hour in enumerate(HOURS):
+        # All angles, then the ephemeris, once or once for each agent
         parts = [observed[k, :, :2].ravel(), observed[k, :fixes, 2:].ravel()]
         state = f.step(state, 3600.0 * hour, [np.concatenate(parts)])
         joint = state.mixtures[0]
@@ -341,7 +360,7 @@ def run_joint(
 PARTS = {"tp": 0, "tv": 3, "ep": 6, "ev": 9}
 """Target's position and velocity, ego's position and velocity: where they begin."""
 ERRORS = ("error_tp", "error_tv", "error_ep", "error_ev")
-CLAIMS = ("claim_tp", "claim_tv", "claim_ep", "claim_ev")
+VARIANCES = ("variance_tp", "variance_tv", "variance_ep", "variance_ev")
 """Reported variances."""
 METRICS = (*ERRORS, "nees_t", "nees_e", "nees", "apart", "score")
 FEATURED = ("none", "c3")
@@ -364,9 +383,10 @@ def score_epoch(beliefs: Beliefs, truth: np.ndarray) -> Scores:
     moments = [belief.moments() for belief in beliefs]
     centre = np.mean([mean[:3] for mean, _ in moments], axis=0)
     for a, (belief, (mean, cov)) in enumerate(zip(beliefs, moments, strict=True)):
+        # Squares are summed over the three components of each part.
         true = truth[target_and_ego(a)]
         error = mean - true
-        sums = {"error": error**2, "claim": np.diag(cov)}
+        sums = {"error": error**2, "variance": np.diag(cov)}
         values = {
             f"{kind}_{part}": float(squares[first : first + 3].sum())
             for kind, squares in sums.items()
@@ -375,6 +395,7 @@ def score_epoch(beliefs: Beliefs, truth: np.ndarray) -> Scores:
         values["nees_t"] = nees_per_component(error[:6], cov[:6, :6])
         values["nees_e"] = nees_per_component(error[6:], cov[6:, 6:])
         values["nees"] = nees_per_component(error, cov)
+        # Squared distance of the target's mean from the agents' average
         values["apart"] = float(((mean[:3] - centre) ** 2).sum())
         values["score"] = float(belief.log_density(true))
         for name, value in values.items():
@@ -396,13 +417,14 @@ def row_columns(scene: str, name: str, scores: list[Scores]) -> dict[str, float]
                 continue
             columns |= {f"{m}_{hour}": float(values[m].mean()) for m in METRICS}
             if scene == "" and name in FEATURED:
-                columns |= {f"{m}_{hour}": float(values[m].mean()) for m in CLAIMS}
+                columns |= {f"{m}_{hour}": float(values[m].mean()) for m in VARIANCES}
                 columns |= {
                     f"{m}{a + 1}_{hour}": float(values[m][a])
                     for m in ERRORS
                     for a in (0, 1)
                 }
         return columns
+    # Other scenes store means over agents and the epochs before the ephemeris.
     early = [scores[k] for k in EARLY]
     for m in METRICS:
         columns[m] = float(np.mean([values[m].mean() for values in early]))
@@ -432,6 +454,7 @@ def round_columns(columns: dict[str, float]) -> dict[str, float]:
 def run_scene(scene: str, seed: np.random.SeedSequence) -> dict[str, float]:
     """Return the columns of all rows of one scene, on one set of data."""
     s = SCENES[scene]
+    # All filters of a scene use the same truth and observations.
     truth, *data = simulate(s, np.random.default_rng(seed))
     columns: dict[str, float] = {}
     for name, options in ROWS[scene].items():
@@ -441,6 +464,7 @@ def run_scene(scene: str, seed: np.random.SeedSequence) -> dict[str, float]:
             columns[column_name(scene, name, m)] = value
         sent = float(states[-1].ledger.scalars.sum())
         columns[column_name(scene, name, "floats")] = sent
+    # The joint filter sends nothing: it has all observations.
     for name, options in joint_rows(scene).items():
         scores = score_all(run_joint(s, options, *data), truth)
         for m, value in row_columns(scene, name, scores).items():
@@ -450,6 +474,7 @@ def run_scene(scene: str, seed: np.random.SeedSequence) -> dict[str, float]:
 
 def scene_seeds(seed: np.random.SeedSequence) -> dict[str, np.random.SeedSequence]:
     """Return each scene's seed; those of the paper's agents and their variations share it."""
+    # Three and five agents share data, so that the effect of the number shows.
     paper, late, crowd = seed.spawn(3)
     seeds = dict.fromkeys(SCENES, paper)
     return seeds | {"late": late, "three": crowd, "five": crowd}
@@ -465,7 +490,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
 
 def blank_scores() -> list[Scores]:
     """Return metrics of zero, of which only the names matter."""
-    return [dict.fromkeys((*METRICS, *CLAIMS), np.zeros(2))] * len(HOURS)
+    return [dict.fromkeys((*METRICS, *VARIANCES), np.zeros(2))] * len(HOURS)
 
 
 def scene_columns(scene: str) -> list[str]:
@@ -511,9 +536,9 @@ max_outliers = 2
 # --------------------------------------------------------------------------------- a quick check
 
 LIVE = {
-    "": ("none", "c3", "one_ci", "news", "bound"),
-    "late": ("news",),
-    "five": ("news",),
+    "": ("none", "c3", "one_ci", "increments", "bound"),
+    "late": ("increments",),
+    "five": ("increments",),
 }
 """Rows that are quick enough to run again wherever the stored study is read."""
 
@@ -525,6 +550,7 @@ def run_live(seed: np.random.SeedSequence) -> dict[str, float]:
     for scene, names in LIVE.items():
         s = SCENES[scene]
         truth, *data = simulate(s, np.random.default_rng(seeds[scene]))
+        # The data are those of the trial, for the quick rows only.
         for name in names:
             if name == "bound":
                 beliefs = run_joint(s, ONE, *data)
@@ -540,6 +566,7 @@ def run_live(seed: np.random.SeedSequence) -> dict[str, float]:
 def load_checked() -> Stored:
     """Return the stored study, after the quick rows of two trials have run again and agree."""
     study = stored(PAPER, NAME)
+    # The names of the columns that the quick rows fill
     quick = {
         column_name(scene, name, m)
         for scene, names in LIVE.items()

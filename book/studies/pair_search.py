@@ -35,6 +35,7 @@ PRINTED = np.array(
         for r in table("semeraro", "table-1")
     ]
 )
+# Five numbers of an arc, in the order of the logarithms
 SHAPES = ("angle_std", "range_std", "ego_std", "width", "span")
 RULES = ("C1", "C2", "C3")
 DISTANCE = 9.0
@@ -48,13 +49,16 @@ BOUNDS = {
     "distance": (2.5, 10.0),
     "turn": (0.5, 2.6),
 }
+# Searches from anywhere, and from near the scenario's pair
 FAR = 3
 NEAR = 5
 DRAWN = 24
 AWAY = 0.1
 """How many far starts are drawn, the best of which is taken; and how far a near one is moved."""
+# Evaluations of a search, and its first step size
 STEPS = {"far": 360, "near": 120}
 SPREAD = {"far": 0.25, "near": 0.05}
+# Points of one score and of the last one; nodes of the quadrature along an axis
 POINTS = 1024
 MANY = 8192
 NODES = 18
@@ -70,6 +74,7 @@ def scenario_parameters() -> np.ndarray:
     """Return the scenario's pair as logarithms of the twelve numbers."""
     shapes = [np.array([float(row[n]) for n in SHAPES]) for row in STUDY.agents]
     places = [np.array(row["place"], dtype=float) for row in STUDY.agents]
+    # Scale lengths so that agent 1 is as far from the target as in the search.
     scale = DISTANCE / np.hypot(*places[0])
     for shape in shapes:
         shape[1:3] *= scale
@@ -81,12 +86,14 @@ def scenario_parameters() -> np.ndarray:
 def fusions(y: np.ndarray) -> list[PartialFusion]:
     """Return both agents' exact fusions for the logarithms of the twelve numbers."""
     v = np.exp(y)
+    # Agent 1 stands at the left, agent 2 is turned by the last number.
     angle = np.pi + v[11]
-    places = (-DISTANCE, 0.0), (v[10] * np.cos(angle), v[10] * np.sin(angle))
-    beliefs = [
-        arcs.arc(6, place, **dict(zip(SHAPES, part, strict=True)))
-        for place, part in zip(places, v[:10].reshape(2, 5), strict=True)
-    ]
+    second_place = v[10] * np.array([np.cos(angle), np.sin(angle)])
+    places = np.array([[-DISTANCE, 0.0], second_place])
+    beliefs = []
+    for place, part in zip(places, v[:10].reshape(2, 5), strict=True):
+        numbers = dict(zip(SHAPES, part, strict=True))
+        beliefs.append(arcs.arc(6, place, **numbers))
     marginals = [m.marginal([0, 1]) for m in beliefs]
     return [PartialFusion(beliefs[k], marginals[1 - k], omega=OMEGA) for k in (0, 1)]
 
@@ -123,9 +130,11 @@ def mix(parts: Sequence[GaussianMixture], shares: np.ndarray) -> GaussianMixture
 def jeffreys(p: np.ndarray, q: np.ndarray, base: np.ndarray) -> float:
     """Jeffreys' divergence from logarithms at points drawn from the base."""
     # Importance weights of both densities, normalized by themselves
-    weights = [np.exp(v - base - (v - base).max()) for v in (p, q)]
-    first, second = ((w * (p - q)).sum() / w.sum() for w in weights)
-    return float(0.5 * (first - second))
+    means = []
+    for logs in (p, q):
+        w = np.exp(logs - base - (logs - base).max())
+        means.append((w * (p - q)).sum() / w.sum())
+    return float(0.5 * (means[0] - means[1]))
 
 
 def log_ratios(y: np.ndarray, u: Cubes) -> np.ndarray:
@@ -140,6 +149,7 @@ def log_ratios(y: np.ndarray, u: Cubes) -> np.ndarray:
         base = np.logaddexp.reduce(logs + np.log(SHARES)[:, None])
         divergences.append([jeffreys(fusion.log_value(x), q, base) for q in logs[:3]])
         targets += [m.marginal([0, 1]) for m in parts[:3]]
+    # The targets of both agents by each rule, on points of all six
     x = map_to_points(mix(targets, np.full(6, 1 / 6)), u[2])
     logs = np.array([m.log_density(x) for m in targets])
     base = np.logaddexp.reduce(logs)
@@ -153,31 +163,28 @@ def log_ratios_by_quadrature(y: np.ndarray) -> np.ndarray:
     mixtures = [fuse_by_rules(f) for f in both]
     divergences = []
     for parts, fusion in zip(mixtures, both, strict=True):
+        # A box about the mean of the three fused mixtures, in four dimensions
         mean, cov = mix(parts, np.full(3, 1 / 3)).moments()
         half = 4.2 * np.sqrt(np.diag(cov))
-        divergences.append(
-            [
-                v.value
-                for v in jeffreys_of_many(
-                    fusion.log_value,
-                    [m.log_density for m in parts],
-                    mean - half,
-                    mean + half,
-                    nodes=NODES,
-                )
-            ]
+        measured = jeffreys_of_many(
+            fusion.log_value,
+            [m.log_density for m in parts],
+            mean - half,
+            mean + half,
+            nodes=NODES,
         )
+        divergences.append([v.value for v in measured])
+    # The targets in the plane, where many nodes are cheap
     pairs = [[m.marginal([0, 1]) for m in pair] for pair in zip(*mixtures, strict=True)]
     mean, cov = mix([m for pair in pairs for m in pair], np.full(6, 1 / 6)).moments()
     half = 4.2 * np.sqrt(np.diag(cov))
-    divergences.append(
-        [
-            jeffreys_of_many(
-                a.log_density, [b.log_density], mean - half, mean + half, nodes=80
-            )[0].value
-            for a, b in pairs
-        ]
-    )
+    between_targets = []
+    for a, b in pairs:
+        (measured,) = jeffreys_of_many(
+            a.log_density, [b.log_density], mean - half, mean + half, nodes=80
+        )
+        between_targets.append(measured.value)
+    divergences.append(between_targets)
     return np.log(np.array(divergences).T / PRINTED)
 
 
@@ -215,6 +222,7 @@ def evolve(
         moves = (rng.standard_normal((OFFSPRING, n)) * lengths) @ axes.T
         costs = np.empty(OFFSPRING)
         for i, move in enumerate(moves):
+            # The fourth power weighs the worst of the nine; the best pair has the least worst.
             logs = log_ratios(y + spread * move, u)
             costs[i] = (logs**4).sum()
             if largest_factor(logs) < least:
@@ -225,20 +233,19 @@ def evolve(
         move = w @ moves[order]
         y = y + spread * move
         # Evolution path of the step size, in units of the covariance's inverse root
-        path_s = (1 - c_s) * path_s + np.sqrt(c_s * (2 - c_s) * mass) * (
-            axes @ (axes.T @ move / lengths)
-        )
-        size = np.linalg.norm(path_s) / np.sqrt(1 - (1 - c_s) ** (2 * (k + 1)))
+        whitened = axes @ (axes.T @ move / lengths)
+        path_s = (1 - c_s) * path_s + np.sqrt(c_s * (2 - c_s) * mass) * whitened
+        # The path starts at zero, so early ones are shorter.
+        share = 1 - (1 - c_s) ** (2 * (k + 1))
+        size = np.linalg.norm(path_s) / np.sqrt(share)
         # Evolution path of the covariance, stalled while steps are too long
         path_c = (1 - c_c) * path_c
         if size < (1.4 + 2 / (n + 1)) * usual:
             path_c += np.sqrt(c_c * (2 - c_c) * mass) * move
         # Rank-one and rank-μ update
-        cov = (
-            (1 - c_1 - c_mu) * cov
-            + c_1 * np.outer(path_c, path_c)
-            + c_mu * (moves[order].T * w) @ moves[order]
-        )
+        rank_one = np.outer(path_c, path_c)
+        rank_mu = c_mu * (moves[order].T * w) @ moves[order]
+        cov = (1 - c_1 - c_mu) * cov + c_1 * rank_one + rank_mu
         # The step size grows while successive steps agree.
         spread *= float(np.exp(c_s / damping * (np.linalg.norm(path_s) / usual - 1)))
     return best
@@ -251,6 +258,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     rng = np.random.default_rng(for_start)
     u = draw_cubes(np.random.default_rng(for_points), POINTS)
     if kind == "far":
+        # Log-uniform within the bounds; the best of a few draws is the start.
         names = (*SHAPES, *SHAPES, "distance", "turn")
         low, high = np.log([BOUNDS[name] for name in names]).T
         drawn = low + rng.random((DRAWN, 12)) * (high - low)
@@ -258,6 +266,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     else:
         y = scenario_parameters() + AWAY * rng.standard_normal(12)
     initial = largest_factor(log_ratios(y, u))
+    # The search lowers the score on its own points; the others are fresh.
     y = evolve(y, u, STEPS[kind], SPREAD[kind], np.random.default_rng(for_moves))
     final = largest_factor(log_ratios(y, u))
     return {
@@ -291,6 +300,7 @@ def load_checked() -> Stored:
         y = np.array([study.columns[f"y_{k}"][index] for k in range(12)])
         return rescore(y, seed.spawn(4)[3])
 
+    # Only the scores run again: a search takes minutes.
     part = type(study)(
         study.path,
         study.metadata,

@@ -1,75 +1,69 @@
-"""How well can the pendulum be known? Cartesian filters, filters in the chart, and a bound.
+"""How well can the pendulum be estimated? Cartesian filters, filters in the chart, and a bound.
 
 Three cases. ``still`` has no process noise, as in the paper; ``noisy`` has some; in
-``mirror`` the sensor sees only \\|x\\|, so that the posterior has two modes for ever.
-All ensembles start on the manifold. True swings start from draws of the prior that
-every filter is given, so that the posterior's mean is the best estimate on average: the
-bound. That of ``still`` is a grid of initial conditions, that of the others particles
-in the chart.
+``mirror`` the sensor measures only \\|x\\|, so that the posterior has two modes for ever.
+All ensembles start on the manifold. The paper's filters have its printed input, those of
+the study `pendulum`. True swings start from draws of the prior that every filter has, so
+that the posterior's mean is the best estimate on average: the bound. That of ``still``
+is a grid of initial conditions, that of the others particles in the chart.
 """
 
-# ruff: noqa: SIM300
 from __future__ import annotations
 
-import warnings
 from functools import partial
 
 import numpy as np
 
-from bookkit.published import scenario
-from distfilt.coupling import norm_constraint, retract
-from distfilt.filters import ParticleCollapse
+from bookkit import studies
+from distfilt.coupling import retract
 from distfilt.metrics import crps
-from distfilt.models import pendulum, pendulum_angle, pendulum_chart, pendulum_states
+from distfilt.models import pendulum_angle, pendulum_chart, pendulum_states
 from distfilt.updates import (
     enkf,
     etkf,
     etpf,
     resample,
-    with_augmentation,
-    with_projection,
     with_retraction,
 )
+from distfilt.validation import skip_validation
 
-# The study counts the runs that lose the truth.
-warnings.filterwarnings("ignore", category=ParticleCollapse)
+pendulum = studies.script("pendulum")
 
 NAME = "pendulum-bound"
 PAPER = "das"
 
-setting = scenario("das", "pendulum")
+scenarios = pendulum.scenarios
+setting = pendulum.setting
 RUNS = 48
 PARTICLES = 4000
 CELLS = 161
 REACH = 0.45
-DT = setting["dt_observe"]
-STEPS = round(setting["end_time"] / DT)
-TIMES = DT * np.arange(1, STEPS + 1)
-LATE = np.flatnonzero(TIMES > setting["score_from"] + 1e-9)
+DT = pendulum.DT
+STEPS = pendulum.STEPS
+TIMES = pendulum.TIMES
+# Scores begin after the prior's offset has died out.
+LATE = np.flatnonzero(TIMES > pendulum.SCORE_FROM + 1e-9)
 LENGTH = setting["length"]
 N = setting["members"]
 START = np.array([np.deg2rad(setting["start_angle"]), setting["start_rate"]])
-NOISE = setting["noise_variance"] * np.eye(2)
+NOISE = pendulum.NOISE
 KICK = np.array([setting["noise_position"], setting["noise_velocity"]])
 PRIOR = (START, setting["prior_std"])
 MIRROR = (np.array([0.0, 0.0]), np.array([0.8, 0.5]))
 
-rod = norm_constraint([0, 1], length=LENGTH)
-motion = ([0, 1], [2, 3])
-options = {
-    "length": LENGTH,
-    "gravity": setting["gravity"],
-    "step": setting["integration_step"],
-}
-cartesian = pendulum(**options)
-chart = pendulum_angle(**options)
-augmented_etpf = with_augmentation(etpf, rod, std=setting["constraint_std"])
-how = {"variant": setting["variant"], "regularisation": setting["regularisation"]}
+rod = pendulum.rod
+motion = pendulum.MOTION
+cartesian = pendulum.swing
+# The same pendulum by its angle and rate, which have no constraint
+chart = pendulum_angle(
+    length=LENGTH,
+    gravity=setting["gravity"],
+    step=setting["integration_step"],
+)
+PAPERS = ("OTF", "OTMA", "OTNLeq", "OTNLeqMA")
 CARTESIAN = {
-    "OTF": etpf,
-    "OTMA": augmented_etpf,
-    "OTNLeq": with_projection(etpf, rod, **how),
-    "OTNLeqMA": with_projection(augmented_etpf, rod, **how),
+    **{name: pendulum.UPDATES[name] for name in PAPERS},
+    # Transport that is not the paper's has the squared distance.
     "OT_retracted": with_retraction(etpf, rod, motion=motion),
     "EnKF_retracted": with_retraction(enkf, rod, motion=motion),
     "EnKF": enkf,
@@ -92,70 +86,74 @@ def to_cartesian(q: np.ndarray) -> np.ndarray:
     return pendulum_states(q, length=LENGTH)
 
 
-def data(rng: np.random.Generator, noisy: bool, prior=PRIOR) -> tuple[np.ndarray, ...]:
+def draw_data(
+    rng: np.random.Generator, noisy: bool, prior=PRIOR
+) -> tuple[np.ndarray, ...]:
     """Draw true chart states (T, 2) and observations (T, 2); return the prior's mean too."""
     centre, std = prior
     state = centre + std * rng.standard_normal(2)
     truth = np.empty((STEPS, 2))
     for k in range(STEPS):
+        # In the case without noise the draws are made all the same.
         state = chart.step(state, 0.0, DT) + noisy * KICK * rng.standard_normal(2)
         truth[k] = state
-    seen = to_cartesian(truth)[:, :2] + np.sqrt(NOISE[0, 0]) * rng.standard_normal(
-        (STEPS, 2)
-    )
-    return truth, seen, centre
+    noise = np.sqrt(NOISE[0, 0]) * rng.standard_normal((STEPS, 2))
+    return truth, to_cartesian(truth)[:, :2] + noise, centre
 
 
 def simulate_many(seeds) -> tuple[np.ndarray, np.ndarray]:
     """Draw many runs of the noisy case: true chart states and observations, (T, R, 2)."""
-    drawn = []
-    for seed in seeds:
-        rng = np.random.default_rng(seed)
-        drawn.append(
-            [rng.standard_normal(shape) for shape in (2, (STEPS, 2), (STEPS, 2))]
-        )
-    first, kicks, errors = (np.stack(x) for x in zip(*drawn, strict=True))
-    state = PRIOR[0] + PRIOR[1] * first
-    truth = np.empty((STEPS, len(first), 2))
+    generators = [np.random.default_rng(seed) for seed in seeds]
+    # The draws of `draw_data`, in its order
+    first = np.stack([rng.standard_normal(2) for rng in generators])
+    kicks = np.empty((STEPS, len(generators), 2))
     for k in range(STEPS):
-        state = truth[k] = chart.step(state, 0.0, DT) + KICK * kicks[:, k]
-    return truth, to_cartesian(truth)[..., :2] + np.sqrt(NOISE[0, 0]) * errors.swapaxes(
-        0, 1
-    )
+        kicks[k] = [rng.standard_normal(2) for rng in generators]
+    errors = np.stack([rng.standard_normal((STEPS, 2)) for rng in generators], axis=1)
+    state = PRIOR[0] + PRIOR[1] * first
+    truth = np.empty((STEPS, len(generators), 2))
+    for k in range(STEPS):
+        state = chart.step(state, 0.0, DT) + KICK * kicks[k]
+        truth[k] = state
+    noise = np.sqrt(NOISE[0, 0]) * errors
+    return truth, to_cartesian(truth)[..., :2] + noise
 
 
-def run_ensembles(updates, members, model, see, readings, noise, noisy, rng):
-    """Analysis members of filters with one model, {name: (T, N, d)}."""
-    inner = {name: update for name, update in updates.items()}
-    x = np.stack([members] * len(inner))
+def run_ensembles(updates, members, model, predict, observations, noise, noisy, rng):
+    """Return analysis members of filters with one model, {name: (T, N, d)}."""
+    x = np.stack([members] * len(updates))
     analysis = np.full((STEPS, *x.shape), np.nan)
+    # Positions come before velocities, in both kinds of states.
     kick = np.repeat(KICK, x.shape[-1] // 2)
-    with np.errstate(all="ignore"):
-        for k, y in enumerate(readings):
+    with skip_validation(), np.errstate(all="ignore"):
+        for k, y in enumerate(observations):
             x = model.transition(x, 0.0, DT)
+            # The same process noise for all filters
             if noisy:
                 x = x + kick * rng.standard_normal(x.shape[1:])
-            for f, update in enumerate(inner.values()):
-                if np.isfinite(x[f]).all():
-                    try:
-                        x[f] = update(x[f], see(x[f]), y, noise, rng=rng)
-                    except (ValueError, RuntimeError, ArithmeticError):
-                        x[f] = np.nan
+            for f, update in enumerate(updates.values()):
+                if not np.isfinite(x[f]).all():
+                    continue
+                try:
+                    x[f] = update(x[f], predict(x[f]), y, noise, rng=rng)
+                except (ValueError, RuntimeError, ArithmeticError):
+                    # A swing that is lost may overflow, or have no coupling.
+                    x[f] = np.nan
             analysis[k] = x
-    return dict(zip(inner, np.moveaxis(analysis, 1, 0), strict=True))
+    return dict(zip(updates, np.moveaxis(analysis, 1, 0), strict=True))
 
 
-def run_ekf(readings, centre, noisy, rng):
+def run_ekf(observations, centre, noisy, rng):
     """Run the extended Kalman filter in the chart; draws of its Gaussian stand for members."""
     m = centre
     p = setting["prior_std"] ** 2 * np.eye(2)
     draws_over_time = []
     draws = rng.standard_normal((N, 2))
     # Draws with mean zero and unit sample covariance
-    draws = (draws - draws.mean(axis=0)) @ np.linalg.inv(
-        np.linalg.cholesky(np.cov(draws.T))
-    ).T
-    for y in readings:
+    anomalies = draws - draws.mean(axis=0)
+    draws = np.linalg.solve(np.linalg.cholesky(np.cov(draws.T)), anomalies.T).T
+    for y in observations:
+        # F P F' + Q
         f = chart.jacobian(m, 0.0, DT)
         m = chart.step(m, 0.0, DT)
         p = f @ p @ f.T + noisy * np.diag(KICK**2)
@@ -163,6 +161,7 @@ def run_ekf(readings, centre, noisy, rng):
         h = LENGTH * np.array([[np.cos(m[0]), 0.0], [-np.sin(m[0]), 0.0]])
         gain = np.linalg.solve(h @ p @ h.T + NOISE, h @ p).T
         m = m + gain @ (y - to_cartesian(m)[:2])
+        # (I - K H) P, made symmetric
         p = (np.eye(2) - gain @ h) @ p
         p = 0.5 * (p + p.T)
         draws_over_time.append(m + draws @ np.linalg.cholesky(p).T)
@@ -178,18 +177,19 @@ def motion_grid() -> tuple[np.ndarray, np.ndarray]:
     if CELLS in CACHE:
         return CACHE[CELLS]
     side = REACH * np.linspace(-1, 1, CELLS)
-    grid = START + np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(
-        -1, 2
-    )
+    offsets = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1)
+    grid = START + offsets.reshape(-1, 2)
     x = grid
+    # Single precision halves the memory; the grid is coarser by far.
     path = np.empty((STEPS, len(grid), 2), dtype=np.float32)
     for k in range(STEPS):
-        x = path[k] = chart.transition(x.copy(), 0.0, DT)
+        x = chart.transition(x.copy(), 0.0, DT)
+        path[k] = x
     CACHE[CELLS] = grid, path
     return grid, path
 
 
-def grid_bound(readings, centre, rng):
+def grid_bound(observations, centre):
     """Draw from the posterior of the motion without noise, (T, 400, 2)."""
     grid, path = motion_grid()
     # Initial conditions far outside the prior are left out.
@@ -197,11 +197,11 @@ def grid_bound(readings, centre, rng):
     likely = np.flatnonzero(logs > -18)
     logs = logs[likely]
     draws = []
-    for k, y in enumerate(readings):
+    for k, y in enumerate(observations):
         states = path[k, likely].astype(np.float64)
-        residual = (
-            LENGTH * np.column_stack([np.sin(states[:, 0]), np.cos(states[:, 0])]) - y
-        )
+        angle = states[:, 0]
+        residual = LENGTH * np.column_stack([np.sin(angle), np.cos(angle)]) - y
+        # log p(x_0) plus the logarithms of all likelihoods so far
         logs = logs - 0.5 * (residual**2).sum(axis=1) / NOISE[0, 0]
         w = np.exp(logs - logs.max())
         # Quantiles of the weights: 400 draws without chance
@@ -211,13 +211,14 @@ def grid_bound(readings, centre, rng):
     return np.array(draws)
 
 
-def particle_bound(readings, members, see, noise, rng):
+def particle_bound(observations, members, predict, noise, rng):
     """Run a bootstrap filter with many particles in the chart, (T, P, 2)."""
     x = members
     draws = []
-    for y in readings:
+    for y in observations:
+        # Its process noise separates copies, so no jitter is needed.
         x = chart.transition(x, 0.0, DT) + KICK * rng.standard_normal(x.shape)
-        logs = -0.5 * ((see(x) - y) ** 2).sum(axis=1) / noise[0, 0]
+        logs = -0.5 * ((predict(x) - y) ** 2).sum(axis=1) / noise[0, 0]
         w = np.exp(logs - logs.max())
         x = x[resample(w / w.sum(), rng=rng)]
         draws.append(x)
@@ -230,7 +231,7 @@ def mean_crps(members: np.ndarray, truth: np.ndarray) -> float:
     return float(np.mean([crps(m, t) for m, t in zip(thinned, truth, strict=True)]))
 
 
-def scores(name, members, truth) -> dict[str, float]:
+def score(name, members, truth) -> dict[str, float]:
     """Return the scores of one filter's members, in the chart (T, N, 2) or Cartesian (T, N, 4)."""
     target = to_cartesian(truth)[LATE]
     late_members = members[LATE]
@@ -239,13 +240,10 @@ def scores(name, members, truth) -> dict[str, float]:
     mean = states.mean(axis=1)
     if not np.isfinite(mean).all():
         return {f"{name}_{key}": np.nan for key in SCORES}
-    length_error = np.abs(np.hypot(mean[:, 0], mean[:, 1]) - LENGTH)
+    # The mean of members on the circle is inside, so it is put back for the report.
     if in_chart or "retracted" in name:
         mean = retract(mean, rod, motion=motion)
-        length_error = np.abs(np.hypot(mean[:, 0], mean[:, 1]) - LENGTH)
-    length_error = np.where(
-        length_error < 1e-14, 0.0, length_error
-    )  # rounding is no number to store
+    length_error = pendulum.measure_length_error(mean)
     error = mean - target
     q = late_members if in_chart else pendulum_chart(late_members)
     # The angle's error, wrapped to (-π, π]
@@ -256,7 +254,7 @@ def scores(name, members, truth) -> dict[str, float]:
         "constraint": np.sqrt((length_error**2).mean()),
         "position": np.sqrt((error[:, :2] ** 2).sum(axis=1).mean()),
         "velocity": np.sqrt((error[:, 2:] ** 2).sum(axis=1).mean()),
-        "honest": np.sqrt((spread[:, 0] ** 2).mean()) / angle,
+        "spread_ratio": np.sqrt((spread[:, 0] ** 2).mean()) / angle,
         "nees": float(
             np.mean((chart_error[:, 0] / np.maximum(spread[:, 0], 1e-12)) ** 2)
         ),
@@ -265,45 +263,58 @@ def scores(name, members, truth) -> dict[str, float]:
     return {f"{name}_{key}": float(value) for key, value in values.items()}
 
 
+def predict_position(q: np.ndarray) -> np.ndarray:
+    """Return the position of chart states."""
+    return to_cartesian(q)[:, :2]
+
+
+def predict_size(q: np.ndarray) -> np.ndarray:
+    """Return |x| of chart states."""
+    return np.abs(to_cartesian(q)[:, :1])
+
+
 def run_case(noisy: bool, rng: np.random.Generator) -> dict[str, float]:
     """Run all filters once, in a case whose whole position is observed."""
-    truth, seen, centre = data(rng, noisy)
+    truth, observations, centre = draw_data(rng, noisy)
     first = centre + setting["prior_std"] * rng.standard_normal((PARTICLES, 2))
     analysis = run_ensembles(
         CARTESIAN,
         to_cartesian(first[:N]),
         cartesian,
         lambda x: x[:, :2],
-        seen,
+        observations,
         NOISE,
         noisy,
         rng,
     )
-    see = lambda q: to_cartesian(q)[:, :2]  # noqa: E731
-    analysis |= run_ensembles(CHART, first[:N], chart, see, seen, NOISE, noisy, rng)
-    analysis["EKF_chart"] = run_ekf(seen, centre, noisy, rng)
-    analysis["bound"] = (
-        particle_bound(seen, first, see, NOISE, rng)
-        if noisy
-        else grid_bound(seen, centre, rng)
+    # The same first members and observations in the chart
+    analysis |= run_ensembles(
+        CHART, first[:N], chart, predict_position, observations, NOISE, noisy, rng
     )
+    analysis["EKF_chart"] = run_ekf(observations, centre, noisy, rng)
+    if noisy:
+        bound = particle_bound(observations, first, predict_position, NOISE, rng)
+    else:
+        bound = grid_bound(observations, centre)
+    analysis["bound"] = bound
     values: dict[str, float] = {}
     for name in FILTERS:
-        values |= scores(name, analysis[name], truth)
+        values |= score(name, analysis[name], truth)
     return values
 
 
 def run_mirror(rng: np.random.Generator) -> dict[str, float]:
     """Return the CRPS of x when only |x| is observed, from a prior about the vertical."""
-    truth, seen, _ = data(rng, True, MIRROR)
-    readings = np.abs(seen[:, :1])
+    truth, observations, _ = draw_data(rng, True, MIRROR)
+    # Only |x| is measured.
+    sizes = np.abs(observations[:, :1])
     noise = NOISE[:1, :1]
+    # About the vertical both swings are equally likely.
     first = MIRROR[0] + MIRROR[1] * rng.standard_normal((PARTICLES, 2))
-    see = lambda q: np.abs(to_cartesian(q)[:, :1])  # noqa: E731
     analysis = run_ensembles(
-        MIRRORED, first[:N], chart, see, readings, noise, True, rng
+        MIRRORED, first[:N], chart, predict_size, sizes, noise, True, rng
     )
-    analysis["bound"] = particle_bound(readings, first, see, noise, rng)
+    analysis["bound"] = particle_bound(sizes, first, predict_size, noise, rng)
     x = to_cartesian(truth)[LATE, :1]
     return {
         f"{name}_crps": mean_crps(to_cartesian(q[LATE])[..., :1], x)
@@ -312,7 +323,7 @@ def run_mirror(rng: np.random.Generator) -> dict[str, float]:
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
-    """One run of every case."""
+    """Run every case once."""
     streams = [np.random.default_rng(s) for s in seed.spawn(3)]
     cases = {
         "still": run_case(False, streams[0]),
@@ -327,12 +338,12 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
 
 
 def noisy_part(seed: np.random.SeedSequence) -> dict[str, float]:
-    """The noisy case of a trial alone, which takes a fifth of its time."""
+    """Run the noisy case of a trial alone, which takes a part of its time."""
     values = run_case(True, np.random.default_rng(seed.spawn(3)[1]))
     return {f"noisy_{key}": value for key, value in values.items()}
 
 
-SCORES = ("constraint", "position", "velocity", "honest", "nees", "crps")
+SCORES = ("constraint", "position", "velocity", "spread_ratio", "nees", "crps")
 parameters = {
     **{name: np.asarray(setting[name]).tolist() for name in setting},
     "bound_runs": RUNS,
@@ -346,14 +357,14 @@ columns = (
     *(f"mirror_{f}_crps" for f in (*MIRRORED, "bound")),
 )
 code = (
-    data,
+    draw_data,
     run_ensembles,
     run_ekf,
     motion_grid,
     grid_bound,
     particle_bound,
     mean_crps,
-    scores,
+    score,
     run_case,
     run_mirror,
 )

@@ -30,6 +30,7 @@ from distfilt.mixtures import (
 NAME = "reductions"
 PAPER = "semeraro"
 OMEGA = 0.5
+# Factors of (41): one that merges much, and the one of our Table 2
 THRESHOLDS = {"strong": 2.0, "mild": 10.0}
 MEMBERS = 4000
 MIXANDS = (7, 9)
@@ -73,6 +74,7 @@ def divergences(
     fusions: list[PartialFusion], pair: list[GaussianMixture], first: int
 ) -> list[float]:
     """Both agents' divergences from the exact density, and that of their targets."""
+    # The proposal covers the approximation and the own belief.
     values = [
         jeffreys_by_sampling(
             m.log_density,
@@ -83,6 +85,7 @@ def divergences(
         ).value
         for k, (f, m) in enumerate(zip(fusions, pair, strict=True))
     ]
+    # Exact fusion gives both agents the same target.
     a, b = (m.marginal([0, 1]) for m in pair)
     target_divergence = jeffreys_by_sampling(
         a.log_density,
@@ -106,6 +109,7 @@ def reduce_shapes(
     merged = [
         runnalls(m, k.n_components) for m, k in zip(marginals, relevant, strict=True)
     ]
+    # Before the product: both marginals are reduced, then multiplied.
     shapes = {
         name: [
             fusions[k].component_shapes(terms="all", marginal=r[k], received=[r[1 - k]])
@@ -113,6 +117,7 @@ def reduce_shapes(
         ]
         for name, r in (("relevance", relevant), ("runnalls", merged))
     }
+    # After the product: pivoted QR picks as many of all terms.
     shapes["qr"] = [
         pivoted_qr(f.component_shapes(terms="all"), n_components=s.n_components)
         for f, s in zip(fusions, shapes["relevance"], strict=True)
@@ -123,6 +128,7 @@ def reduce_shapes(
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One pair, reduced in three ways by each of two factors."""
     for_pair, for_points = (np.random.default_rng(s) for s in seed.spawn(2))
+    # Agent 1 looks along the first axis, agent 2 from another side.
     turn = for_pair.uniform(*arcs.BOUNDS["turn"])
     beliefs = [
         arcs.draw_belief(b, for_pair, mixands=MIXANDS) for b in (np.pi, np.pi + turn)
@@ -130,6 +136,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     marginals = [m.marginal([0, 1]) for m in beliefs]
     fusions = [PartialFusion(beliefs[k], marginals[1 - k], omega=OMEGA) for k in (0, 1)]
     first_seed = int(for_points.integers(2**31))
+    # All rules and factors are compared on points of the same seeds.
     values = {}
     for name, threshold in THRESHOLDS.items():
         for rule, shapes in reduce_shapes(fusions, marginals, threshold).items():
@@ -138,6 +145,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
                 (1, 2, "target"), divergences(fusions, fused, first_seed), strict=True
             ):
                 values[f"{name}_{rule}_{k}"] = value
+        # Sizes before and after the reduction
         for k in (0, 1):
             size = merge_irrelevant(
                 marginals[k], marginals[1 - k], threshold=threshold

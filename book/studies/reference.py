@@ -47,12 +47,12 @@ APPLIES = [(a.kind, list(a.dims)) for a in SETUP.scenario.agents] == [
 ]
 columns = [
     *(
-        f"{name}_{what}_{r}"
+        f"{name}_{quantity}_{r}"
         for name in ("reference", "bound")
-        for what in ("mse", "nees", "chance", "share")
+        for quantity in ("mse", "nees", "chance", "share")
         for r in range(BATCH)
     ),
-    *(f"damped_{what}_{r}" for what in ("mse", "nees") for r in range(BATCH)),
+    *(f"damped_{quantity}_{r}" for quantity in ("mse", "nees") for r in range(BATCH)),
     *satellites.score_columns(SETUP, "exact", BATCH, each_agent=False),
     *satellites.time_columns(SETUP, "reference"),
 ]
@@ -66,6 +66,7 @@ def run_particles(
     seen: list[np.ndarray], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Run two filters; return means (T, 2, R, 6), covariances (T, R, 6, 6), effective shares."""
+    # Two filters with half of the particles each
     n = parameters["particles"] // 2
     lead = (2, seen[0].shape[1])
     dt = float(SETUP.times[0])
@@ -74,11 +75,13 @@ def run_particles(
     q = SETUP.model.Q(0.0, dt)
     flat = np.ix_(PLANE, PLANE)
     up = np.ix_(NORMAL, NORMAL)
+    # Positions of A and the plane's velocities of C are linear in the plane.
     in_plane = np.concatenate([seen[0], seen[2][..., :2]], axis=-1)
     noise = np.diag([stds[0]] * 2 + [stds[2]] * 2)
     m = np.broadcast_to(SETUP.prior[0][PLANE], (*lead, n, 4))
     p = np.broadcast_to(SETUP.prior[1][flat], (*lead, 4, 4))
     z = np.broadcast_to(SETUP.prior[0][NORMAL], (*lead, n, 2))
+    # The prior of (z, vz) after the first step
     wide = f[up] @ SETUP.prior[1][up] @ f[up].T
     log = np.zeros((*lead, n))
     means = []
@@ -91,6 +94,7 @@ def run_particles(
         gap = in_plane[k][:, None] - m
         s = p + noise
         log = log - 0.5 * (gap * np.linalg.solve(s, gap.mT).mT).sum(axis=-1)
+        # K = P S⁻¹, by a solve, and P⁺ = P - K P
         gain = np.linalg.solve(s, p).mT
         m = m + gap @ gain.mT
         p = p - gain @ p
@@ -101,10 +105,12 @@ def run_particles(
         gap = seen[2][k, :, 2, None] - z[..., 1]
         log = log - 0.5 * gap**2 / s
         z = z + gap[..., None] * spread[:, 1] / s
+        # Cov(z, vz | velocity) = C - c cᵀ / s
         root = factor(spread - np.outer(spread[:, 1], spread[1]) / s)
         m, z, log = resample_poor(m, z, log, rng)
         z = z + rng.standard_normal(z.shape) @ root.T
         m, p, log = update_angle(m, p, z, log, seen[1][k][..., None], stds[1])
+        # Moments of both filters' particles, and of the plane's Gaussians
         w = normalize_logs(log)
         x = np.concatenate([m, z], axis=-1)
         means.append(np.einsum("hrn,hrnj->hrj", w, x))
@@ -112,7 +118,9 @@ def run_particles(
         cov = np.einsum("hrni,hrnj->rij", 0.5 * w[..., None] * anomalies, anomalies)
         cov[:, :4, :4] += p.mean(axis=0)
         covs.append(cov)
+        # Effective sample size 1 / Σw² as a share of the particles
         shares.append(1 / (w**2).sum(axis=-1).max(axis=0) / n)
+    # Components in the order of the state again
     back = np.argsort(PLANE + NORMAL)
     return (
         np.array(means)[..., back],
@@ -150,11 +158,13 @@ def update_angle(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Update by the angle arctan(z/y): weights, and mean and variance of y."""
     nodes, shares = np.polynomial.hermite_e.hermegauss(parameters["nodes"])
+    # Nodes of Gauss-Hermite quadrature over y
     variance = p[..., 1, 1]
     steps = np.sqrt(variance)[..., None, None] * nodes
     gap = angle - np.arctan2(z[..., :1], m[..., 1:2] + steps)
     # The angle of a line has period π.
     gap = (gap + np.pi / 2) % np.pi - np.pi / 2
+    # Posterior shares of the nodes, their sum and their moments
     parts = np.exp(-0.5 * gap**2 / noise) * (shares / shares.sum())
     total = np.maximum(parts.sum(axis=-1), 1e-300)
     shift = (parts * steps).sum(axis=-1) / total
@@ -163,6 +173,7 @@ def update_angle(
     log = log + np.log(total)
     # The other components follow y by regression.
     slope = p[..., 1] / variance[..., None]
+    # All particles share the mean of their variances that are left.
     less = (normalize_logs(log) * variance_left).sum(axis=-1) - variance
     p = p + less[..., None, None] * slope[..., None] * slope[..., None, :]
     return m + shift[..., None] * slope[..., None, :], p, log
@@ -182,7 +193,7 @@ def squared_distances(gap: np.ndarray, cov: np.ndarray) -> np.ndarray:
     return np.einsum("ri,ri->r", gap, np.linalg.solve(cov, gap[..., None])[..., 0])
 
 
-def run_damped(means: np.ndarray, readings: np.ndarray) -> list[np.ndarray]:
+def run_damped(means: np.ndarray, observations: np.ndarray) -> list[np.ndarray]:
     """Run the iterated extended filter; a step that does not lower `cost` is halved."""
     sensor = stack(SETUP.sensors)
     s = SETUP
@@ -190,7 +201,8 @@ def run_damped(means: np.ndarray, readings: np.ndarray) -> list[np.ndarray]:
     errors = []
     covs = []
     t0 = 0.0
-    for t, y in zip(s.times, readings, strict=True):
+    for t, y in zip(s.times, observations, strict=True):
+        # Forecast by the model's Jacobian
         slope = s.model.jacobian(means, t0, t - t0)
         cov = slope @ cov @ slope.mT + s.model.Q(t0, t - t0)
         means = x = s.model.step(means, t0, t - t0)
@@ -205,6 +217,7 @@ def run_damped(means: np.ndarray, readings: np.ndarray) -> list[np.ndarray]:
         lowest_cost = value(x)
         for _ in range(STEPS):
             h = sensor.jacobian(x)
+            # Innovation of the sensor linearized at x: y - h(x) - H (m - x)
             expected = np.einsum("...ij,...j->...i", h, means - x)
             gap = sensor.residual(y, sensor.predict(x)) - expected
             full_step = condition(means, cov, gap, h, sensor.noise_cov)[0] - x
@@ -213,6 +226,7 @@ def run_damped(means: np.ndarray, readings: np.ndarray) -> list[np.ndarray]:
                 if not (worse := after > lowest_cost).any():
                     break
                 full_step[worse] /= 2
+            # A step that never lowers the cost is not made.
             full_step[worse] = 0.0
             after[worse] = lowest_cost[worse]
             x = x + full_step
@@ -220,6 +234,7 @@ def run_damped(means: np.ndarray, readings: np.ndarray) -> list[np.ndarray]:
             lowest_cost = after
             if decrease.max() < ENOUGH:
                 break
+        # The covariance of the sensor linearized at the last x
         h = sensor.jacobian(x)
         cov = condition(means, cov, np.zeros_like(y), h, sensor.noise_cov)[1]
         means = x
@@ -240,6 +255,7 @@ def score_means(
     """Return error, NEES/d, the error's share by chance, effective sample size; over time."""
     means, covs, shares = estimates
     late = SETUP.settled
+    # The estimate is the mean of both filters.
     gap = means.mean(axis=1) - truth
     error = (gap**2).sum(axis=-1)
     score = nees(means.mean(axis=1), covs, truth) / gap.shape[-1]
@@ -272,6 +288,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     rng = np.random.default_rng(for_particles)
     truth, seen = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
     values = score_means("reference", truth, run_particles(seen, rng))
+    # The damped iterated filter on the same data
     first = np.broadcast_to(SETUP.prior[0], truth.shape[1:])
     estimates = run_damped(first, np.concatenate(seen, axis=-1))
     late = SETUP.settled
@@ -281,6 +298,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         )
         score = nees(estimates[0][:, r], estimates[1][:, r], truth[:, r])[late].mean()
         values[f"damped_nees_{r}"] = float(score) / truth.shape[-1]
+    # Truths from the prior: the posterior mean is a bound here.
     truth, seen = simulate_from_prior(np.random.default_rng(for_prior))
     values |= score_means("bound", truth, run_particles(seen, rng))
     result = satellites.run_filter(

@@ -23,6 +23,7 @@ from distfilt.network import Channel, graphs
 NAME = "singles"
 PAPER = "semeraro"
 METRICS = ("error_tp", "error_ep", "nees_t", "nees_e", "nees")
+# None: a row of the study `orbit`; else unscented filters, and whether they fuse
 ROWS = {"one_none": None, "one_ci": None, "unscented_none": False, "unscented_ci": True}
 
 
@@ -30,6 +31,7 @@ def fuse_targets(
     belief: tuple[np.ndarray, np.ndarray], channel: Channel
 ) -> tuple[np.ndarray, np.ndarray]:
     """Intersect the targets' covariances, as a fusion rule of `GaussianFilter`."""
+    # One component each: the fusion of mixtures is then covariance intersection.
     mixtures = [GaussianMixture.gaussian(m, p) for m, p in zip(*belief, strict=True)]
     fuse = partial(fuse_moments, omega="equal")
     fused = [
@@ -43,6 +45,7 @@ def run_unscented(
 ) -> list[list[GaussianMixture]]:
     """Run unscented filters of one Gaussian; return beliefs by epoch and agent."""
     n = len(s["agents"])
+    # Observations stay with their agent; only beliefs about the target are sent.
     start = [b.moments() for b in paper.prior_beliefs(first, covs)]
     f = GaussianFilter(
         paper.orbit_model(s, 2),
@@ -71,8 +74,10 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     s = paper.SETTING
     # The draws of the study `orbit`
     truth, *inputs = paper.simulate(s, np.random.default_rng(seed.spawn(1)[0]))
+    # The joint filter has all observations: the reference.
     beliefs = {"bound": paper.run_joint(s, paper.ONE, *inputs)}
     for row, fuses in ROWS.items():
+        # The same data for each row
         if fuses is None:
             states = paper.run_filter(s, paper.SINGLE[row], *inputs)
             beliefs[row] = [state.mixtures for state in states]
@@ -80,10 +85,12 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
             beliefs[row] = run_unscented(s, fuses, *inputs)
     values: dict[str, float] = {}
     for row, row_beliefs in beliefs.items():
+        # Means over agents and the epochs before the ephemeris
         scores = [paper.score_epoch(row_beliefs[k], truth[k]) for k in paper.EARLY]
         values |= {
             f"{row}_{m}": float(np.mean([f[m].mean() for f in scores])) for m in METRICS
         }
+    # Six digits are stored.
     return {name: float(paper.SIX.format(v)) for name, v in values.items()}
 
 

@@ -21,6 +21,7 @@ NAME = "truncation"
 PAPER = "zheng"
 CHOICES = densities.CHOICES
 DT = densities.SWARM["dt"]
+# Columns of the shared basis, and times of the comparison in s
 RANKS = (20, 40, 60, 100, 200)
 TIMES = (1, 3, 10, 30)
 columns = [f"rank_{r}_{t}" for r in RANKS for t in TIMES] + [
@@ -40,12 +41,14 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     h = CHOICES["bandwidth"]
     flow = density.FokkerPlanck(swarm, cells)
     agents = int(densities.SWARM["agents"])
+    # All waves but the constant one
     full = density.zero_mean_prior(
         cells,
         rank=cells.size - 1,
         length=CHOICES["prior_length"],
         std=CHOICES["prior_std"],
     )
+    # Agents start evenly.
     x = rng.random((agents, 2))
     p = np.ones(cells.size)
     y = density.kernel_density(x, cells, bandwidth=h)
@@ -68,6 +71,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         }
         t = round((j + 1) * DT, 6)
         if t in TIMES:
+            # Distances relative to the dense estimate's size
             size = np.linalg.norm(dense.mean)
             metrics |= {
                 f"rank_{r}_{t:.0f}": np.linalg.norm(s.estimates[0] - dense.mean) / size

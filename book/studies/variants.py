@@ -30,15 +30,19 @@ RULES = (
     "flooding_half",
     "neighbours",
 )
+# All rules, slow interpretation
 TABLE = swarm.Case(start="peaked", end=15.0)
-QUICK = swarm.Case(reading="gibbs", start="peaked", end=15.0)
+# The fast interpretation, with the right and with a wrong model
+QUICK = swarm.Case(interpretation="gibbs", start="peaked", end=15.0)
 WRONG = swarm.Case(
-    reading="gibbs", start="peaked", end=15.0, phase=CHOICES["wrong_phase"]
+    interpretation="gibbs", start="peaked", end=15.0, phase=CHOICES["wrong_phase"]
 )
+# A fifth of the agents drops out.
 DROP = swarm.Case(start="peaked", end=15.0, gone=swarm.SHARING["gone"])
 DROPS = ("central", "paper", "flooding", "flooding_forgets")
 BASES = ("central", "paper", "flooding")
 OPEN = ("kde", "open", "open_flat")
+# Times of the curves, in s
 MARKS = tuple(range(1, 16))
 CURVES = {
     "table": (*OPEN, *BASES),
@@ -69,6 +73,7 @@ def final_scores(state: object, p: np.ndarray) -> dict[str, float]:
     """NEES and CRPS per cell at the end."""
     from distfilt.metrics import gaussian_crps
 
+    # Of a Gaussian in each cell; a variance of zero up to rounding is a small one.
     gap = state.estimates - p
     variance = np.maximum(state.variances, 1e-12)
     return {
@@ -80,6 +85,7 @@ def final_scores(state: object, p: np.ndarray) -> dict[str, float]:
 def curves(key: str, run: dict[str, np.ndarray]) -> dict[str, float]:
     """Return errors at the marks by rule, means over the local filters."""
     dt = swarm.SWARM["dt"]
+    # References have one error a step, rules one for each local filter.
     lines = {
         n: run[n] if n in OPEN else run[f"{n}_error"].mean(axis=1) for n in CURVES[key]
     }
@@ -93,9 +99,7 @@ def curves(key: str, run: dict[str, np.ndarray]) -> dict[str, float]:
 def wrong_model(rng: np.random.Generator) -> dict[str, float]:
     """Local filters whose f is out of phase, with Q = 0 and with Q > 0."""
     # Process noise in proportion to the leading modes of the prior
-    scale = dict(zip(CHOICES["readings"], CHOICES["process_scale"], strict=True))[
-        "gibbs"
-    ]
+    scale = swarm.densities.choice("process_scale", "gibbs")
     filters = {f"{s}_exact": swarm.make_filter(s, WRONG, 3) for s in BASES}
     filters |= {
         f"{s}_process": swarm.make_filter(
@@ -103,6 +107,7 @@ def wrong_model(rng: np.random.Generator) -> dict[str, float]:
         )
         for s in BASES
     }
+    # All on the same agents
     run, _ = swarm.compare_filters(WRONG, rng, filters)
     errors = {
         f"wrong_{s}": swarm.average(run[f"{s}_error"], WRONG, 10.0).mean()
@@ -114,7 +119,9 @@ def wrong_model(rng: np.random.Generator) -> dict[str, float]:
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One run of each case."""
+    # Each case has agents of its own.
     table, quick, drop, wrong = (np.random.default_rng(s) for s in seed.spawn(4))
+    # The true density at the end of a case
     last: list[np.ndarray] = [np.empty(0)]
 
     def keep(t: float, x: np.ndarray, p: np.ndarray, states: object) -> None:
@@ -134,11 +141,13 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         if key == "table":
             metrics |= curves(key, run)
         for s in names:
+            # Of the fast case only errors are stored.
             if key == "gibbs":
                 metrics[f"gibbs_{s}"] = late[f"{s}_error"].mean()
                 continue
             metrics[f"{key}_{s}_error"] = late[f"{s}_error"].mean()
             metrics[f"{key}_{s}_consensus"] = late[f"{s}_consensus"].mean()
+            # Number of agents that each believes there are
             metrics[f"{key}_{s}_counted"] = float(np.median(ends[s].positions_sent[:3]))
             metrics |= {
                 f"{key}_{s}_{k}": v for k, v in final_scores(ends[s], last[0]).items()

@@ -38,6 +38,7 @@ COLUMNS = (
     "verdict",
     "ours",
     "null",
+    "control",
     "range",
     "published",
     "why",
@@ -130,6 +131,7 @@ class LedgerClaim:
     holds: bool
     ours: str
     null: str
+    control: str
     range: str
 
 
@@ -154,21 +156,18 @@ def claims_of(row: dict[str, str]) -> list[LedgerClaim]:
     # Each cell of the row lists the claims by their ids, in its own form.
     ours = split_claims(row["ours"], r"(?P<id>[a-z0-9-]+) (?P<word>holds|fails): ")
     ids = "|".join(dict.fromkeys(match["id"] for _, match, _ in ours))
-    # Nulls and ranges are matched to the claims by start and id.
-    nulls = {}
-    for start, match, text in split_claims(row["null"], rf"(?P<id>{ids}), "):
-        nulls[start, match["id"]] = text
-    ranges = {}
-    for start, match, text in split_claims(row["range"], rf"(?P<id>{ids}) "):
-        ranges[start, match["id"]] = text
+    # Nulls, controls and ranges are matched to the claims by start and id.
+    evidence: dict[str, dict[tuple[str, str], str]] = {}
+    for column, end in (("null", ", "), ("control", ", "), ("range", " ")):
+        evidence[column] = {}
+        for start, match, text in split_claims(row[column], rf"(?P<id>{ids}){end}"):
+            evidence[column][start, match["id"]] = text
     claims = []
     for start, match, text in ours:
         key = (start, match["id"])
         holds = match["word"] == "holds"
-        null = nulls.get(key, "")
-        claims.append(
-            LedgerClaim(key[1], start, holds, text, null, ranges.get(key, ""))
-        )
+        texts = {name: by_claim.get(key, "") for name, by_claim in evidence.items()}
+        claims.append(LedgerClaim(match["id"], start, holds, text, **texts))
     return claims
 
 

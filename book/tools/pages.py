@@ -26,7 +26,7 @@ from sphinx.pycode import ModuleAnalyzer
 from bookkit.rows import read_rows
 from common import BOOK, ROOT, SLIDER, chapters, toc_pages
 from distfilt.validation import ALLOW_NAN
-from ledger import ITEMS, LEDGER, WORDS, claims_of, summaries
+from ledger import ITEMS, LEDGER, WORDS, LedgerClaim, claims_of, summaries
 
 PAPERS = {
     "grange": "Triangular transport maps",
@@ -563,8 +563,56 @@ def reproductions_text() -> str:
     return "\n".join(lines)
 
 
+def listed_claims(row: dict[str, str]) -> dict[str, dict[str, str]]:
+    """Return the claims that are listed for an item of the ledger, by their ids."""
+    folder = ROOT / "data" / "published" / row["paper"]
+    name = row["item"].lower()
+    # "Fig. 1" has its claims in figure-1.csv, "Table 2" in table-2-claims.csv.
+    stem = name.replace("fig. ", "figure-").replace("table ", "table-")
+    path = folder / f"{stem}{'' if stem.startswith('figure') else '-claims'}.csv"
+    return {claim["id"]: claim for claim in read_rows(path)}
+
+
+CLAIM_COLUMNS = {
+    "Claim": "claim",
+    "Verdict": "verdict",
+    "Ours": "ours",
+    "If false": "null",
+    "If true": "control",
+}
+"""Columns of the table of claims, and the fields that they show."""
+
+
+def claims_table(
+    claims: list[LedgerClaim], listed: dict[str, dict[str, str]]
+) -> list[str]:
+    """Return a Markdown table with one row a claim."""
+    rows = []
+    for claim in claims:
+        start = f" ({claim.start})" if claim.start else ""
+        rows.append(
+            {
+                "claim": listed[claim.id]["claim"] + start,
+                "verdict": "holds" if claim.holds else "fails",
+                "ours": claim.ours,
+                "null": claim.null,
+                "control": claim.control,
+            }
+        )
+    # A column without an entry is left out.
+    shown = {
+        head: name
+        for head, name in CLAIM_COLUMNS.items()
+        if any(row[name] for row in rows)
+    }
+    lines = [f"| {' | '.join(shown)} |", "|---" * len(shown) + "|"]
+    for row in rows:
+        lines += [f"| {' | '.join(cell(row[name]) for name in shown.values())} |"]
+    return [*lines, ""]
+
+
 def claims_text(row: dict[str, str], title: str) -> list[str]:
-    """Return the evidence of one verdict: each claim with our number, its null and its range."""
+    """Return the evidence of one verdict: a table with one row a claim, then rules and ranges."""
     lines = [f"### {row['item']}: {title}", "", f"Verdict: **{row['verdict']}**."]
     if row["why"]:
         lines[-1] += f" Why: {row['why']}."
@@ -576,23 +624,14 @@ def claims_text(row: dict[str, str], title: str) -> list[str]:
             f"Ours: {row['ours'] or '–'}. Published: {row['published'] or '–'}.",
             "",
         ]
-    folder = ROOT / "data" / "published" / row["paper"]
-    name = row["item"].lower()
-    # "Fig. 1" has its claims in figure-1.csv, "Table 2" in table-2-claims.csv.
-    stem = name.replace("fig. ", "figure-").replace("table ", "table-")
-    path = folder / f"{stem}{'' if stem.startswith('figure') else '-claims'}.csv"
-    listed = {claim["id"]: claim for claim in read_rows(path)}
+    listed = listed_claims(row)
+    lines += claims_table(claims, listed)
     # Claims of two starts share a rule, which is shown once.
     for k in dict.fromkeys(claim.id for claim in claims):
-        lines += [f"{listed[k]['claim']}", f": *Rule:* {listed[k]['criterion']}"]
-        for claim in (c for c in claims if c.id == k):
+        lines += [listed[k]["claim"], f": *Rule:* {listed[k]['criterion']}"]
+        for claim in (c for c in claims if c.id == k and c.range):
             start = f", {claim.start}" if claim.start else ""
-            lines += [
-                "",
-                f": *Ours{start}* ({'holds' if claim.holds else 'fails'}): {claim.ours}",
-            ]
-            lines += ["", f": *If the claim were false{start}:* {claim.null}"]
-            lines += ["", f": *Range{start}:* {claim.range}"] if claim.range else []
+            lines += ["", f": *Range{start}:* {claim.range}"]
         lines += [""]
     return lines
 

@@ -57,7 +57,7 @@ _TIE_BREAK = 1e-7
 at most this more."""
 _FAR = 1e-6
 """Members are far from each other if a quarter of the costs is below this part of the range. Above
-it what the addition may cost is at most a tenth of the lower quartile of the costs."""
+it the addition costs at most a tenth of the lower quartile of the costs."""
 _ROUNDING = 1e-28
 """Copies of a member are up to this part of the largest squared distance apart."""
 _NO_MASS = 1e-15
@@ -145,16 +145,16 @@ def transport_plans(
     log_weights : array_like, (..., N)
         Logarithms of their weights, in any normalisation.
     cost : {"squared", "distance"}
-        What a unit of mass pays: the squared Euclidean distance, which makes the limit of many
-        members a map (Reich), or the distance itself, which Das and Bhattacharya print below (5).
+        The cost of a unit of mass: the squared Euclidean distance (Reich), with which the loss of
+        spread vanishes as members become many, or the distance itself, which Das and Bhattacharya
+        print below (5).
 
     Returns
     -------
     ndarray, (..., N, N)
-        Row i is the distribution of member i's mass. If several
-        plans are optimal, as with copies of a member, a fixed addition of at most 1e-7 of the
-        largest cost makes the choice. Where members are far from most others it is at most 1e-7
-        of the lower quartile of the costs.
+        Row i is the distribution of member i's mass. If several plans are optimal, as with copies
+        of a member, a fixed addition of at most 1e-7 of the largest cost makes the choice. Where
+        members are far from most others it is at most 1e-7 of the lower quartile of the costs.
 
     Examples
     --------
@@ -234,7 +234,7 @@ def _couple_far_members(
     needed = needed + _tie_breaker(n)[rows] * typical
     mass = weights[rows].sum()
     part = _solve_in_stages(needed, weights[rows] / mass, equal, typical, solve)
-    # What hardly has any weight goes everywhere alike, so that the masses stay exact.
+    # Members of hardly any weight go everywhere alike, so that the masses stay exact.
     plan = np.outer(weights, equal)
     plan[rows] = mass * part
     return plan

@@ -5,11 +5,14 @@ import scipy.linalg  # noqa: F401
 
 from ..updates.particles import ParticleCollapse
 from .base import Filter, SensorFilter
+from .consensus import InformationConsensusFilter
 from .density import DensityFilter, DensityState
 from .ensemble import EnsembleFilter, TransportFilter
 from .failures import FilterError
 from .gaussian import GaussianFilter, GaussianState
+from .grid import GridFilter, GridState
 from .increments import InformationIncrementFilter, information_increment
+from .likelihood import LikelihoodConsensusFilter, PolynomialBasis
 from .mixture import MixtureFilter, MixtureState
 from .observations import Observation
 from .options import (
@@ -25,8 +28,12 @@ from .priors import prior_moments
 from .record import Summary, final_state
 from .states import SensorState, State
 from .step import Step
+from .sum import GaussianSumFilter, GaussianSumState
+from .tree import ChannelFilter, ChannelFilterState
 
 __all__ = [
+    "ChannelFilter",
+    "ChannelFilterState",
     "DensityFilter",
     "DensityState",
     "EnsembleFilter",
@@ -36,13 +43,20 @@ __all__ = [
     "FusesBeliefs",
     "GaussianFilter",
     "GaussianState",
+    "GaussianSumFilter",
+    "GaussianSumState",
+    "LikelihoodConsensusFilter",
     "MixtureFilter",
     "MixtureState",
+    "GridFilter",
+    "GridState",
+    "InformationConsensusFilter",
     "InformationIncrementFilter",
     "IsolatesRuns",
     "KeepsPast",
     "ParticleCollapse",
     "ParticleFilter",
+    "PolynomialBasis",
     "Observation",
     "ScoresObservations",
     "SensorFilter",

@@ -60,6 +60,8 @@ __all__ = ["Filter", "SensorFilter"]
 
 S = TypeVar("S", bound=State)
 
+_FLOAT64 = np.dtype(np.float64)
+
 
 @dataclass(frozen=True, eq=False)
 class Filter(FrozenModel, ABC, Generic[S]):
@@ -769,7 +771,7 @@ class SensorFilter(Filter[S]):
         for agent, (value, size) in enumerate(zip(observations, sizes, strict=True)):
             if (
                 type(value) is not np.ndarray
-                or value.dtype != np.float64
+                or value.dtype != _FLOAT64
                 or value.shape != (*runs, size)
                 or np.count_nonzero(np.isfinite(value)) < value.size
             ):

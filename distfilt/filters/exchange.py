@@ -42,13 +42,10 @@ def collect_observations(step: Step[AnyState]) -> Known:
     if sent and step.filter.hops != 1:
         inbox = _flood(step, sent)
     elif sent:
-        payloads = [_pack(step, of_agent) for of_agent in sent]
-        inbox = step.channel.broadcast(payloads)
-    own_labels = [_label(step, of_agent) for of_agent in observed]
+        inbox = step.channel.broadcast(_pack(step, sent))
+    own_labels = _label(step, observed)
     # Receivers know their neighbours' sensors, so only values travel.
-    sent_labels = own_labels
-    if step.state.pending:
-        sent_labels = [_label(step, of_agent) for of_agent in sent]
+    sent_labels = _label(step, sent) if step.state.pending else own_labels
     by_time: Known = {}
     for agent, messages in enumerate(inbox):
         # In order of the senders, so that all agents with the same set have the same order.
@@ -130,35 +127,49 @@ def _refuse_waiting_changes(
                 )
 
 
-def _pack(step: Step[AnyState], observations: list[Observation]) -> Any:
-    """Pack an agent's observations into one payload; None if there is none.
+def _pack(step: Step[AnyState], sent: list[list[Observation]]) -> list[Any]:
+    """Pack each agent's observations into one payload; None if there is none.
 
     The usual case, one present observation of the agent's first sensor, is its value alone.
     Otherwise a last part holds the time, the number of the sensor and the metadata of each.
     """
-    if not observations:
-        return None
-    numbers = _describe(step, observations)
-    if not numbers:
-        return observations[0].value
-    # The same labels in all runs.
-    labels = np.broadcast_to(np.array(numbers), (*step.runs, len(numbers)))
-    return (*[observation.value for observation in observations], labels)
+    payloads: list[Any] = []
+    for observations, numbers in zip(sent, _describe(step, sent), strict=True):
+        values = [observation.value for observation in observations]
+        if not values:
+            payloads.append(None)
+        elif not numbers:
+            payloads.append(values[0])
+        else:
+            # The same labels in all runs.
+            labels = np.broadcast_to(np.array(numbers), (*step.runs, len(numbers)))
+            payloads.append((*values, labels))
+    return payloads
 
 
-def _describe(step: Step[AnyState], observations: list[Observation]) -> list[float]:
-    """Return the numbers that travel with observations: time, sensor and metadata of each.
+def _describe(step: Step[AnyState], sent: list[list[Observation]]) -> list[list[float]]:
+    """Return the numbers that travel with each agent's observations.
 
-    One present observation of the agent's first sensor needs none.
+    They are time, sensor and metadata of each. One present observation of the agent's first
+    sensor needs none.
     """
-    numbers: list[float] = []
-    for observation in observations:
-        # A sensor of the observation's own has no number; its metadata describe it.
-        number = observation.sensor if isinstance(observation.sensor, int) else -1
-        numbers += [observation.t, number, *observation.metadata]
-    # Time and sensor go without saying: now, and the first one.
-    is_plain = len(observations) == 1 and numbers in ([step.t, 0], [step.t, -1])
-    return [] if is_plain else numbers
+    described = []
+    for observations in sent:
+        numbers: list[float] = []
+        if len(observations) == 1:
+            (only,) = observations
+            # Time and sensor go without saying: now, and the first one.
+            if only.t == step.t and only.sensor == 0 and not only.metadata:
+                described.append(numbers)
+                continue
+        for observation in observations:
+            # A sensor of the observation's own has no number; its metadata describe it.
+            number = observation.sensor if isinstance(observation.sensor, int) else -1
+            numbers += [observation.t, number, *observation.metadata]
+        # So does a sensor of its own without metadata.
+        is_plain = len(observations) == 1 and numbers == [step.t, -1]
+        described.append([] if is_plain else numbers)
+    return described
 
 
 def _flood(step: Step[AnyState], sent: list[list[Observation]]) -> list[dict[int, Any]]:
@@ -168,25 +179,28 @@ def _flood(step: Step[AnyState], sent: list[list[Observation]]) -> list[dict[int
     """
     bundles: list[tuple[Array, ...] | None] = []
     labels = []
-    for agent, observations in enumerate(sent):
-        values = tuple([observation.value for observation in observations])
+    for agent, numbers in enumerate(_describe(step, sent)):
+        values = tuple([observation.value for observation in sent[agent]])
         bundles.append(values or None)
-        labels.append(np.array([agent, *_describe(step, observations)], dtype=float))
+        labels.append(np.array([agent, *numbers], dtype=float))
     hops = step.filter.hops
     limit = None if hops == "all" else hops
     return flood_observations(step.channel, bundles, labels, limit)
 
 
 def _label(
-    step: Step[AnyState], observations: list[Observation]
-) -> list[tuple[float, Sensor]]:
-    """Return the time and the sensor of each observation."""
+    step: Step[AnyState], observed: list[list[Observation]]
+) -> list[list[tuple[float, Sensor]]]:
+    """Return the time and the sensor of each agent's observations."""
     labels = []
-    for observation in observations:
-        sensor = observation.sensor
-        if not isinstance(sensor, Sensor):
-            sensor = step.filter.agent_sensors[observation.agent][sensor]
-        labels.append((observation.t, sensor))
+    for observations in observed:
+        of_agent = []
+        for observation in observations:
+            sensor = observation.sensor
+            if not isinstance(sensor, Sensor):
+                sensor = step.filter.agent_sensors[observation.agent][sensor]
+            of_agent.append((observation.t, sensor))
+        labels.append(of_agent)
     return labels
 
 
@@ -232,8 +246,14 @@ def _apply_rule(rule: Any, beliefs: list[Array], channel: Channel) -> tuple[Arra
         raise ValueError(
             f"fusion must return {len(beliefs)} arrays, got {len(results)}"
         )
-    pairs = zip(results, beliefs, strict=True)
-    return tuple([check_array(new, "fusion", old.shape) for new, old in pairs])
+    checked = []
+    for new, old in zip(results, beliefs, strict=True):
+        is_array = type(new) is np.ndarray and new.dtype == np.float64
+        has_shape = is_array and new.shape == old.shape
+        if not has_shape or np.count_nonzero(np.isfinite(new)) < new.size:
+            new = check_array(new, "fusion", old.shape)
+        checked.append(new)
+    return tuple(checked)
 
 
 def _merge_channels(before: Channel, used: list[Channel], run_numbers: Any) -> Channel:

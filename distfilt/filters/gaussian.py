@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Annotated, Any, ClassVar, Literal, Self, cast
 
 import numpy as np
@@ -17,8 +17,8 @@ from ..linalg import (
     EPS,
     cholesky,
     deviations,
-    identity,
     factor,
+    identity,
     solve_semidefinite,
     solve_upper,
     symmetrise,
@@ -49,7 +49,10 @@ from .resets import Reset, reset_gaussian
 from .states import SensorState
 from .step import Received, Step
 
-__all__ = ["GaussianFilter", "GaussianState"]
+__all__ = ["GaussianFamily", "GaussianFilter", "GaussianState"]
+
+_FARTHEST = 1e6
+"""The longest step of an iterated update, in standard deviations of the forecast."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -118,49 +121,14 @@ class GaussianState(SensorState):
 
 
 @dataclass(frozen=True, eq=False)
-class GaussianFilter(
+class GaussianFamily(
     SensorFilter[GaussianState],
-    FusesBeliefs[GaussianState],
-    SharesObservations[GaussianState],
-    ExchangesAtIntervals[GaussianState],
-    KeepsPast[GaussianState],
     IsolatesRuns[GaussianState],
     ScoresObservations[GaussianState],
 ):
-    """One Kalman filter per agent; for a linear model and linear sensors it is exact.
+    """The common part of filters whose agents hold Gaussians: forecast and update.
 
-    Parameters
-    ----------
-    model, sensors, graph, gate_probability, faults, names
-        As for :class:`~distfilt.filters.SensorFilter`.
-    fusion, share_observations, hops, lag, on_error, exchange_interval, record_evidence
-        As in :mod:`distfilt.filters.options`. The rule is a function
-        ``fusion((means, covs), channel) -> (means, covs)``, such as
-        :func:`distfilt.network.covariance_intersection`.
-    linearization : {"extended", "unscented"}
-        How a nonlinear model or sensor is made linear: by its derivative at the mean, or by
-        2d + 1 points about it.
-    kappa : float
-        The unscented points lie :math:`\\sqrt{d+\\kappa}` standard deviations from the mean, at
-        least 0, so that no weight is negative.
-    inflation : float
-        Factor of the forecast's standard deviations, at least 0.5; for 5 % it is 1.05.
-
-    Examples
-    --------
-    >>> from distfilt.models import Model
-    >>> from distfilt.network import covariance_intersection, graphs
-    >>> from distfilt.sensors import component
-    >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: dt * np.eye(1))
-    >>> f = GaussianFilter(
-    ...     walk,
-    ...     [component([0], std=1.0), None],
-    ...     graphs.path(2),
-    ...     share_observations=False,
-    ...     fusion=covariance_intersection,
-    ... )
-    >>> f.step(f.start(([0.0], [[4.0]])), 1.0, [[2.0], None]).means.ravel().round(3)
-    array([1.429, 1.429])
+    Families differ in what the agents exchange.
     """
 
     _: KW_ONLY
@@ -170,7 +138,11 @@ class GaussianFilter(
 
     state_class: ClassVar[type[Any]] = GaussianState
     batched_summary: ClassVar[bool] = True
-    belief_kind: ClassVar[str | None] = "gaussians"
+
+    @cached_property
+    def iterations(self) -> int:
+        """How often an update linearises its sensors; once in most families."""
+        return 1
 
     def check_state(self, state: GaussianState) -> None:
         """Refuse a state that is not of this filter."""
@@ -200,10 +172,6 @@ class GaussianFilter(
         """Return the state with a new belief about some components."""
         return cast(GaussianState, reset_gaussian(state, reset))
 
-    def insert_time(self, state: GaussianState, t: float) -> GaussianState:
-        """Return the state with a belief about a time between two that it keeps."""
-        return insert_gaussian(self, state, t)
-
     def next_state(self, step: Step[GaussianState]) -> GaussianState:
         """Forecast, condition on the received observations, fuse.
 
@@ -212,17 +180,29 @@ class GaussianFilter(
         RuntimeWarning
             If a standard deviation after the fusion is below the rounding of its mean.
         """
-        means, covs = self._forecast(step)
-        # Failed runs get a harmless Gaussian, so that the batch can go on.
-        unit = identity(means.shape[-1])
-        means = step.check_forecast(means, 0.0)
-        covs = step.check_forecast(covs, unit)
+        means, covs = self._assimilate(step)
+        if step.has_fusion:
+            means, covs = self._fuse(means, covs, step)
+        return self._end(step, means, covs)
+
+    def _assimilate(self, step: Step[GaussianState]) -> tuple[Array, Array]:
+        """Return the joint moments after the forecast and the received observations."""
+        means, covs = self._check_forecast(step)
         for place, group in step.received():
             self._condition(means, covs, place, group, step)
         # A run that failed here needs a covariance with a Cholesky factor in the fusion.
-        covs = step.keep_failed(covs, unit)
-        if step.has_fusion:
-            means, covs = self._fuse(means, covs, step)
+        return means, step.keep_failed(covs, identity(means.shape[-1]))
+
+    def _check_forecast(self, step: Step[GaussianState]) -> tuple[Array, Array]:
+        """Return the forecast's joint moments; failed runs get a harmless Gaussian."""
+        means, covs = self._forecast(step)
+        means = step.check_forecast(means, 0.0)
+        return means, step.check_forecast(covs, identity(means.shape[-1]))
+
+    def _end(
+        self, step: Step[GaussianState], means: Array, covs: Array, **fields: Array
+    ) -> GaussianState:
+        """Return the state after the step with these joint moments, and a family's own fields."""
         if self.periods:
             # The mean of each time by itself: a covariance does not depend on the branch.
             n_times = means.shape[-1] // self.model.dim
@@ -232,6 +212,7 @@ class GaussianFilter(
             joint_covariances=symmetrise(covs),
             dim=step.state.dim,
             history=step.times[::-1],
+            **fields,
         )
 
     def summarize(self, state: GaussianState) -> Summary:
@@ -316,7 +297,7 @@ class GaussianFilter(
             # For a linear function unscented points would give the same.
             value = function(mean[..., None, :])[..., 0, :]
             return value, jacobian(mean, cov), None
-        root = _factor_covariance(cov)
+        root, divisor = _factor_covariance(cov)
         d = mean.shape[-1]
         points, weights = unscented_points(mean, root, kappa=self.kappa)
         values = function(points)
@@ -327,7 +308,7 @@ class GaussianFilter(
         ahead = values[..., 1 : d + 1, :]
         behind = values[..., d + 1 :, :]
         scaled_slope = (ahead - behind) / (2 * np.sqrt(d + self.kappa))
-        slope = solve_upper(_fill_zero_columns(root), scaled_slope).mT
+        slope = solve_upper(divisor, scaled_slope).mT
         # The covariance of the values beyond the linear part H P Hᵀ.
         total = (weights[:, None] * anomalies).mT @ anomalies
         extra = total - scaled_slope.mT @ scaled_slope
@@ -354,6 +335,73 @@ class GaussianFilter(
         joint_cov = covs[..., rows, :, :]
         mean = joint_mean[..., block]
         cov = joint_cov[..., block, block]
+        group, predicted, slope, extra = self._predict(mean, cov, group, step)
+        # r = y* - h(m); NaN where a component is missing, which `condition` leaves out.
+        innovation = group.target - predicted
+        if self.iterations > 1 and not group.linear:
+            innovation, slope = self._relinearize(
+                mean, cov, innovation, slope, group, step
+            )
+        if joint_mean.shape[-1] > d:
+            # Zero slope in the other times' states.
+            joint_slope = np.zeros((*slope.shape[:-1], joint_mean.shape[-1]))
+            joint_slope[..., block] = slope
+            slope = joint_slope
+        arrays: tuple[Array, ...] = (joint_mean, joint_cov, innovation, slope)
+        if extra is not None:
+            # S = H P Hᵀ + R, where the extra covariance of the unscented points counts as noise.
+            arrays = (*arrays, group.noise + extra)
+        means[..., rows, :], covs[..., rows, :, :] = step.apply(
+            _condition_rows,
+            arrays,
+            (joint_mean, joint_cov),
+            group.agents,
+            shared=group.noise,
+        )
+
+    def _relinearize(
+        self,
+        mean: Array,
+        cov: Array,
+        innovation: Array,
+        slope: Array,
+        group: Received,
+        step: Step[GaussianState],
+    ) -> tuple[Array, Array]:
+        """Return innovations and slopes of sensors linearised about the updated mean, repeatedly.
+
+        Each is a step of Gauss and Newton to the maximum of the posterior density.
+        """
+        for _ in range(self.iterations - 1):
+            x, _ = step.apply(
+                _condition_rows,
+                (mean, cov, innovation, slope),
+                (mean, cov),
+                group.agents,
+                shared=group.noise,
+            )
+            # A step that leaves the belief is not taken, and the rest of a batch goes on.
+            is_near = np.abs(x - mean) <= _FARTHEST * deviations(cov)
+            x = np.where(is_near.all(axis=-1, keepdims=True), x, mean)
+            predicted = group.predict(x[..., None, :], branch="first")[..., 0, :]
+            new_slope = group.jacobian(x, cov)
+            # y - h(x) - H (m - x): the innovation of the linearised sensor at the forecast
+            shift = (new_slope @ (mean - x)[..., None])[..., 0]
+            new = group.target - predicted - shift
+            # A sensor that cannot see from there keeps its linearisation.
+            is_blind = np.isnan(new)
+            innovation = np.where(is_blind, innovation, new)
+            slope = np.where(is_blind[..., None], slope, new_slope)
+        return innovation, slope
+
+    def _predict(
+        self, mean: Array, cov: Array, group: Received, step: Step[GaussianState]
+    ) -> tuple[Received, Array, Array, Array | None]:
+        """Predict a group's observations by Gaussians (*runs, G, d) of their time.
+
+        Returns the group without the observations that the gate rejects, the predictions, NaN
+        where the sensor cannot see, their slope, and their extra covariance, if any.
+        """
         linear = group.linear
         predict = partial(group.predict, branch="first")
         predicted, slope, extra = self._linearize(
@@ -373,24 +421,7 @@ class GaussianFilter(
             return predicted, predicted_cov if extra is None else predicted_cov + extra
 
         group = step.gate(group, moments, predicted[..., None, :])
-        if joint_mean.shape[-1] > d:
-            # Zero slope in the other times' states.
-            joint_slope = np.zeros((*slope.shape[:-1], joint_mean.shape[-1]))
-            joint_slope[..., block] = slope
-            slope = joint_slope
-        # r = y* - h(m); NaN where a component is missing, which `condition` leaves out.
-        innovation = group.target - predicted
-        arrays: tuple[Array, ...] = (joint_mean, joint_cov, innovation, slope)
-        if extra is not None:
-            # S = H P Hᵀ + R, where the extra covariance of the unscented points counts as noise.
-            arrays = (*arrays, group.noise + extra)
-        means[..., rows, :], covs[..., rows, :, :] = step.apply(
-            _condition_rows,
-            arrays,
-            (joint_mean, joint_cov),
-            group.agents,
-            shared=group.noise,
-        )
+        return group, predicted, slope, extra
 
     def _leave_out_unseen(
         self,
@@ -464,22 +495,93 @@ class GaussianFilter(
         return means + shift, covs + gain @ (fused_cov - cov) @ gain.mT
 
 
-def _factor_covariance(cov: Array) -> Array:
-    """Return the lower factor of covariances, with zero columns where they are singular.
+@dataclass(frozen=True, eq=False)
+class GaussianFilter(
+    GaussianFamily,
+    FusesBeliefs[GaussianState],
+    SharesObservations[GaussianState],
+    ExchangesAtIntervals[GaussianState],
+    KeepsPast[GaussianState],
+):
+    """One Kalman filter per agent; for a linear model and linear sensors it is exact.
 
-    >>> _factor_covariance(np.diag([4.0, 0.0]))
+    Parameters
+    ----------
+    model, sensors, graph, gate_probability, faults, names
+        As for :class:`~distfilt.filters.SensorFilter`.
+    fusion, share_observations, hops, lag, on_error, exchange_interval, record_evidence
+        As in :mod:`distfilt.filters.options`. The rule is a function
+        ``fusion((means, covs), channel) -> (means, covs)``, such as
+        :func:`distfilt.network.covariance_intersection`.
+    linearization : {"extended", "unscented"}
+        How a nonlinear model or sensor is made linear: by its derivative at the mean, or by
+        2d + 1 points about it.
+    kappa : float
+        The unscented points lie :math:`\\sqrt{d+\\kappa}` standard deviations from the mean, at
+        least 0, so that no weight is negative.
+    inflation : float
+        Factor of the forecast's standard deviations, at least 0.5; for 5 % it is 1.05.
+    iterations : int
+        How often an extended update linearises its sensors: about the forecast's mean first, then
+        about the updated one. More than 1 is the iterated extended filter, for sensors that are
+        accurate beside the curvature of their function (B. M. Bell and F. W. Cathey, IEEE
+        Transactions on Automatic Control 38 (1993) 294-297).
+
+    Examples
+    --------
+    >>> from distfilt.models import Model
+    >>> from distfilt.network import covariance_intersection, graphs
+    >>> from distfilt.sensors import component
+    >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: dt * np.eye(1))
+    >>> f = GaussianFilter(
+    ...     walk,
+    ...     [component([0], std=1.0), None],
+    ...     graphs.path(2),
+    ...     share_observations=False,
+    ...     fusion=covariance_intersection,
+    ... )
+    >>> f.step(f.start(([0.0], [[4.0]])), 1.0, [[2.0], None]).means.ravel().round(3)
+    array([1.429, 1.429])
+    """
+
+    _: KW_ONLY
+    iterations: PositiveInt = 1
+
+    belief_kind: ClassVar[str | None] = "gaussians"
+
+    def check_parts(self) -> None:
+        """Refuse iterations of an update that has no derivative."""
+        super().check_parts()
+        if self.iterations > 1 and self.linearization == "unscented":
+            raise ValueError(
+                "iterations must be 1 for the linearization 'unscented', got "
+                f"{self.iterations}"
+            )
+
+    def insert_time(self, state: GaussianState, t: float) -> GaussianState:
+        """Return the state with a belief about a time between two that it keeps."""
+        return insert_gaussian(self, state, t)
+
+
+def _factor_covariance(cov: Array) -> tuple[Array, Array]:
+    """Return the lower factor of covariances, and one with an inverse.
+
+    The first has zero columns where a covariance is singular, the second ones on its diagonal.
+
+    >>> _factor_covariance(np.diag([4.0, 0.0]))[0]
     array([[2., 0.],
            [0., 0.]])
     """
     with suppress(np.linalg.LinAlgError):
-        return cholesky(cov)
+        root = cholesky(cov)
+        return root, root
     root = factor(cov)
     std = np.sqrt(np.abs(np.diagonal(cov, axis1=-2, axis2=-1)))
     scale = std[..., :, None] * std[..., None, :]
     # A negative eigenvalue has no root, so that the product misses the covariance.
     if not (np.abs(root @ root.mT - cov) <= 1e-9 * scale).all():
         raise np.linalg.LinAlgError("covariance must be positive semidefinite")
-    return root
+    return root, _fill_zero_columns(root)
 
 
 def _fill_zero_columns(root: Array) -> Array:

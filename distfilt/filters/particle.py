@@ -20,7 +20,7 @@ from .record import Summary
 from .states import SensorState
 from .step import Received, Step, copy_rng
 
-__all__ = ["ParticleFilter", "ParticleState"]
+__all__ = ["ParticleFamily", "ParticleFilter", "ParticleState"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -72,44 +72,10 @@ class ParticleState(SensorState):
 
 
 @dataclass(frozen=True, eq=False)
-class ParticleFilter(
-    MembersFilter[ParticleState],
-    SharesObservations[ParticleState],
-    ExchangesAtIntervals[ParticleState],
-):
-    """One bootstrap particle filter per agent, for any model and sensors.
+class ParticleFamily(MembersFilter[ParticleState]):
+    """The common part of filters whose agents hold particles: forecast, weights, resampling.
 
-    Parameters
-    ----------
-    model, sensors, graph, gate_probability, faults, names
-        As for :class:`~distfilt.filters.SensorFilter`.
-    fusion, share_observations, hops, lag, on_error, exchange_interval, record_evidence
-        As in :mod:`distfilt.filters.options`. The rule is one of ensembles; agents resample
-        before it.
-    members : int
-        Number N of particles of each agent.
-    ess_threshold : float
-        An agent resamples, by :func:`distfilt.updates.resample`, when its effective sample size
-        falls below this fraction of N, in [0, 1].
-    jitter : float, optional
-        Bandwidth of the kernel that separates copies, in [0, 1], in units of the particles'
-        weighted spread; 0 for none. Particles that were not copied stay. By default Silverman's
-        for a model without noise, whose copies never part by themselves. For others it is used
-        only where few ancestors are left, whose descendants the noise has not separated.
-
-    Notes
-    -----
-    N. J. Gordon, D. J. Salmond, A. F. M. Smith, IEE Proceedings F 140 (1993) 107-113.
-
-    Examples
-    --------
-    >>> from distfilt.models import Model
-    >>> from distfilt.sensors import component
-    >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
-    >>> f = ParticleFilter(walk, [component([0], std=1.0)], members=500)
-    >>> state = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(1))
-    >>> f.summarize(f.step(state, 1.0, [[3.0]])).mean.round(1)
-    array([[1.9]])
+    Families differ in what the agents exchange.
     """
 
     _: KW_ONLY
@@ -154,24 +120,12 @@ class ParticleFilter(
             stack[-1] = step.check_forecast(moved, origin)
             if self.notices_wrapping:
                 warn_of_wrapping(self.model, origin, moved, state.t, step.dt)
-        for place, group in step.received():
-            self._weight(log_weights, stack, place, group, origin, step)
+        self._assimilate(log_weights, stack, origin, step)
         if self.periods:
             # Moments and fusion need one branch: that about the weighted particles' direction.
             weights = np.exp(log_weights)
             stack = [fold(paths, self.periods, weights) for paths in stack]
-        if step.has_fusion:
-            # A fusion rule moves an ensemble, so the particles need equal weights.
-            offset = step.rng.random((*log_weights.shape[:-1], 1))
-            everybody = np.ones(log_weights.shape[:-1], bool)
-            weights = np.exp(log_weights)
-            self._select(stack, log_weights, weights, everybody, offset, ancestors)
-        fused = stack[-1]
-        past = stack[:-1]
-        if step.has_fusion:
-            fused = fuse_members(step, fused)
-            # The fusion moves the present particles; the earlier ones follow by regression.
-            past = regress_past(stack, fused)
+        past, fused = self._fuse(log_weights, stack, ancestors, step)
         if self.periods:
             weights = np.exp(log_weights)
             fused = settle(fused, self.periods, weights)
@@ -181,6 +135,36 @@ class ParticleFilter(
         )
         self._warn(after, worth)
         return after
+
+    def _assimilate(
+        self,
+        log_weights: Array,
+        stack: list[Array],
+        origin: Array,
+        step: Step[ParticleState],
+    ) -> None:
+        """Multiply the weights by the likelihoods of the observations, in place."""
+        for place, group in step.received():
+            self._weight(log_weights, stack, place, group, origin, step)
+
+    def _fuse(
+        self,
+        log_weights: Array,
+        stack: list[Array],
+        ancestors: Indices,
+        step: Step[ParticleState],
+    ) -> tuple[list[Array], Array]:
+        """Return the earlier and the present members after the fusion rule, if any."""
+        if not step.has_fusion:
+            return stack[:-1], stack[-1]
+        # A fusion rule moves an ensemble, so the particles need equal weights.
+        offset = step.rng.random((*log_weights.shape[:-1], 1))
+        everybody = np.ones(log_weights.shape[:-1], bool)
+        weights = np.exp(log_weights)
+        self._select(stack, log_weights, weights, everybody, offset, ancestors)
+        fused = fuse_members(step, stack[-1])
+        # The fusion moves the present particles; the earlier ones follow by regression.
+        return regress_past(stack, fused), fused
 
     def summarize(self, state: ParticleState) -> Summary:
         """Return weighted moments, effective sizes and the fraction of distinct particles."""
@@ -290,15 +274,13 @@ class ParticleFilter(
         noise = step.rng.standard_normal(before.shape) if bandwidth else None
         # N_eff = 1 / Σ w²
         is_due = state.effective_size < self.ess_threshold * self.members
-        if not is_due.any():
+        if not np.count_nonzero(is_due):
             return log_weights, ancestors, np.inf
         is_few = is_due & self._has_few_ancestors(ancestors)
         is_few[state.failed] = False
         if noise is None and not np.count_nonzero(is_few):
             # The usual case: no copies to separate, no families to look into.
-            self._select(
-                stack, log_weights, state.weights, is_due, offset, ancestors
-            )
+            self._select(stack, log_weights, state.weights, is_due, offset, ancestors)
             return log_weights, ancestors, np.inf
         least = max(_FEWEST, 0.02 * self.members)
         sizes, shares = measure_families(
@@ -451,11 +433,57 @@ class ParticleFilter(
         # component is known, all particles are compared.
         stride = max(1, self.members // (4 * math.ceil(fewest)))
         first = np.sort(points[..., ::stride, 0])
-        n_distinct = (first[..., 1:] > first[..., :-1]).sum(axis=-1)
+        differs = first[..., 1:] > first[..., :-1]
+        n_differences = differs.shape[-1]
+        if n_differences >= fewest and np.count_nonzero(differs) == differs.size:
+            return float(n_differences)
+        n_distinct = differs.sum(axis=-1)
         bound = float(n_distinct.min(initial=self.members))
         if bound < fewest:
             bound = particles.distinct_fraction(points).min() * self.members
         return bound
+
+
+@dataclass(frozen=True, eq=False)
+class ParticleFilter(
+    ParticleFamily,
+    SharesObservations[ParticleState],
+    ExchangesAtIntervals[ParticleState],
+):
+    """One bootstrap particle filter per agent, for any model and sensors.
+
+    Parameters
+    ----------
+    model, sensors, graph, gate_probability, faults, names
+        As for :class:`~distfilt.filters.SensorFilter`.
+    fusion, share_observations, hops, lag, on_error, exchange_interval, record_evidence
+        As in :mod:`distfilt.filters.options`. The rule is one of ensembles; agents resample
+        before it.
+    members : int
+        Number N of particles of each agent.
+    ess_threshold : float
+        An agent resamples, by :func:`distfilt.updates.resample`, when its effective sample size
+        falls below this fraction of N, in [0, 1].
+    jitter : float, optional
+        Bandwidth of the kernel that separates copies, in [0, 1], in units of the particles'
+        weighted spread; 0 for none. Particles that were not copied stay. By default Silverman's
+        for a model without noise, whose copies never part by themselves. For others it is used
+        only where few ancestors are left, whose descendants the noise has not separated.
+
+    Notes
+    -----
+    N. J. Gordon, D. J. Salmond, A. F. M. Smith, IEE Proceedings F 140 (1993) 107-113.
+
+    Examples
+    --------
+    >>> from distfilt.models import Model
+    >>> from distfilt.sensors import component
+    >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
+    >>> f = ParticleFilter(walk, [component([0], std=1.0)], members=500)
+    >>> state = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(1))
+    >>> f.summarize(f.step(state, 1.0, [[3.0]])).mean.round(1)
+    array([[1.9]])
+    """
 
 
 _TINY = np.finfo(float).tiny
@@ -497,8 +525,9 @@ def measure_families(
     sizes = np.full(agents.shape, np.inf)
     shares = np.ones(agents.shape)
     for index in zip(*np.nonzero(agents), strict=True):
-        x = points[index]
-        w = weights[index][:, None]
+        # Components first, so that sums run along all particles.
+        x = np.ascontiguousarray(points[index].T)
+        w = weights[index]
         labels = ancestors[index]
         # Descendants of one ancestor stand together.
         is_start = np.ones(labels.size, dtype=bool)
@@ -513,11 +542,10 @@ def measure_families(
         # Means of the families, at each of their members.
         weighted = w * x
         positive = np.maximum(mass, _TINY)
-        means = np.add.reduceat(weighted, starts) / positive
-        means = means[is_start.cumsum() - 1]
-        mean = weighted.sum(axis=0)
-        within = (w * (x - means) ** 2).sum(axis=0)
-        total = (w * (x - mean) ** 2).sum(axis=0)
+        means = np.add.reduceat(weighted, starts, axis=-1) / positive
+        mean = weighted.sum(axis=-1)
+        within = (x - means[:, is_start.cumsum() - 1]) ** 2 @ w
+        total = (x - mean[:, None]) ** 2 @ w
         # A component that is known has no variance but rounding.
         is_spread = np.asarray(total > (1e-12 * np.abs(mean)) ** 2)
         if not is_spread.any():

@@ -503,7 +503,9 @@ class Step(Generic[S]):
         fields: dict[str, Any] = {}
         # A family may keep its past in its own form; otherwise it is (time, belief) pairs.
         if "history" not in belief:
-            fields["history"] = tuple([pair for pair in pairs if pair[0] in self.lagged])
+            fields["history"] = tuple(
+                [pair for pair in pairs if pair[0] in self.lagged]
+            )
         if self.references is not None:
             # Beliefs with which sensors of changes compare, beyond those of the lag.
             kept = self.references.kept.difference(self.lagged)
@@ -868,7 +870,7 @@ class Received:
             check = name_of_check("h", states)
             if not sensor.uses_previous and not needs_check(sensor, check):
                 self._checked.add((sensor, is_single))
-        if sensor.wraps and branch != "each":
+        if self.wraps and sensor.wraps and branch != "each":
             return _gather_predictions(sensor, values, states, previous)
         return values
 
@@ -997,7 +999,7 @@ def _gather_predictions(
         slope = sensor.jacobian(mean[..., 0, :])
         return np.asarray(fallback() + (states - mean) @ slope.mT)
 
-    return gather(values, sensor.bring_near, tangent, fallback)
+    return gather(values, sensor.bring_near, tangent, fallback, half_periods)
 
 
 @lru_cache(maxsize=32)

@@ -132,7 +132,7 @@ def filterpy_ekf(
         dt = float(clock[k + 1] - clock[k])
         # The linearisation is about the last analysis mean.
         kf.F = model.jacobian(kf.x, t, dt, std=deviations(kf.P))
-        kf.Q = model.Q(t, dt)
+        kf.Q = model.noise_at(kf.x, t, dt)
         forecast = model.step(kf.x, t, dt)
         kf.predict()
         # filterpy predicts the mean by F; the nonlinear model is more accurate.
@@ -197,7 +197,7 @@ def filterpy_ukf(
     def step(kf: Any, k: int, z: Array, present: Mask) -> None:
         t = float(clock[k])
         dt = float(clock[k + 1] - clock[k])
-        kf.Q = model.Q(t, dt)
+        kf.Q = model.noise_at(kf.x, t, dt)
         # filterpy calls fx and hx for one sigma point after the other: both are computed here in
         # one call, and handed out in that order.
         points = kf.points_fn.sigma_points(kf.x, kf.P)

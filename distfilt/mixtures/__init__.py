@@ -18,7 +18,12 @@ from .reduction import (
     pivoted_qr,
     runnalls,
 )
-from .splitting import nonlinearity, split_components, split_library
+from .splitting import (
+    nonlinearity,
+    split_components,
+    split_gaussian,
+    split_library,
+)
 
 __all__ = [
     "Divergence",
@@ -38,6 +43,7 @@ __all__ = [
     "pivoted_qr",
     "runnalls",
     "split_components",
+    "split_gaussian",
     "split_library",
     "nonlinearity",
     "target_fusion",

@@ -1,6 +1,7 @@
 """Networks of agents: graphs, channels with a ledger of messages, consensus and fusion."""
 
 from . import graphs, weights
+from .belief_propagation import gaussian_belief_propagation
 from .channel import Channel, fusion_rule
 from .consensus import (
     AdmmResult,
@@ -24,6 +25,7 @@ from .fusion import (
 )
 from .gossip import gossip_consensus
 from .graphs import Graph
+from .information import diffuse_means, information_consensus
 from .ledger import Ledger
 from .pairwise import (
     covariance_union,
@@ -32,6 +34,7 @@ from .pairwise import (
     split_covariance_intersection,
 )
 from .pi_estimator import PIState, pi_start, pi_step, stable_substeps
+from .trees import fuse_on_tree
 from .weights import ConsensusWeights, UnstableGain
 
 __all__ = [
@@ -50,13 +53,17 @@ __all__ = [
     "consensus_pull",
     "covariance_intersection",
     "covariance_union",
+    "diffuse_means",
     "ellipsoidal_intersection",
     "event_triggered",
     "finite_time_consensus",
     "flooding",
+    "fuse_on_tree",
     "fusion_rule",
+    "gaussian_belief_propagation",
     "gossip_consensus",
     "graphs",
+    "information_consensus",
     "intersect_ensembles",
     "inverse_covariance_intersection",
     "max_consensus",

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, Literal, TypeVar, cast
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..periods import Periods
 from ..validation import (
     Array,
     ArrayInput,
     Indices,
+    InvalidArgumentError,
     Mask,
     MaskInput,
     PositiveInt,
@@ -24,7 +26,7 @@ from ..validation import (
 )
 from .faults import Faults
 from .graphs import Graph, as_graph
-from .ledger import Counts, Ledger, Payload, count_payload, mask_lost
+from .ledger import Counts, Ledger
 from .weights import (
     ConsensusWeights,
     _check_same_links,
@@ -56,26 +58,31 @@ LossRule = Literal["mutual", "metropolis", "keep", "renormalise", "zero"]
 BeliefKind = Literal[
     "vectors", "ensembles", "gaussians", "mixtures", "densities", "particles"
 ]
+Part = NDArray[Any]
+Payload = Part | tuple[Part, ...]
+"""A message: a numeric array, or a flat tuple of them."""
 F = TypeVar("F", bound=Callable[..., object])
 P = TypeVar("P", bound=Payload)
 
 
-@dataclass(frozen=True)
-class _Size:
+class _Size(NamedTuple):
     """The scalars and bytes of a round's messages: one number, or one for each link or agent.
 
     Those of a `transmission` that reaches all receivers of an agent are None if each
-    message is a transmission of its own.
+    message is a transmission of its own. It `is_common` if the messages on the agent's
+    links are of its size.
     """
 
     scalars: int | Counts
     bytes: int | Counts
     transmission: tuple[int | Counts, int | Counts] | None = None
+    is_common: bool = False
 
     @classmethod
     def of_floats(cls, numbers: int) -> _Size:
         """Return the size of so many floats, the same for all receivers."""
-        return cls(numbers, 8 * numbers, (numbers, 8 * numbers))
+        transmission = numbers, 8 * numbers
+        return cls(numbers, 8 * numbers, transmission, is_common=True)
 
 
 class Channel:
@@ -132,7 +139,7 @@ class Channel:
         self.expects_parts = False
         self._ledger = Ledger.empty(self.graph.n_agents) if ledger is None else ledger
         # Losses are drawn for `_n_drawn` runs, of which this channel's are `_drawn`.
-        self._n_drawn = int(np.prod(runs, dtype=np.int64))
+        self._n_drawn = math.prod(runs)
         self._drawn = slice(None)
         # Rounds without faults that are not yet in the ledger, by the size of a
         # message.
@@ -188,13 +195,21 @@ class Channel:
             and integers become floats there.
         """
         graph = self.graph
-        copies, scalars, bytes_ = count_payload(payloads, graph.n_agents, self.runs)
+        copies, scalars, bytes_ = _count_payloads(payloads, graph.n_agents, self.runs)
         # Copies have the types of what was given.
         sent = cast(list[P], copies)
         # A link is used if its sender is not silent.
         sends = np.array([payload is not None for payload in sent])
-        size = _Size(scalars[graph.senders], bytes_[graph.senders], (scalars, bytes_))
-        arrived = self._transmit(sends[graph.senders], size)
+        size = _Size(
+            scalars[graph.senders],
+            bytes_[graph.senders],
+            (scalars, bytes_),
+            is_common=True,
+        )
+        used = sends[graph.senders]
+        arrived = self._transmit(used, size)
+        if self._perfect:
+            return _group_by_receiver(graph, sent, np.flatnonzero(used))
         # A message is in the inbox if any run has received it.
         received = np.flatnonzero(arrived.any(axis=0))
         inbox = _group_by_receiver(graph, sent, received)
@@ -204,7 +219,7 @@ class Channel:
             receiver = int(graph.receivers[link])
             sender = int(graph.senders[link])
             by_run = arrived[:, link].reshape(self.runs)
-            masked = mask_lost(inbox[receiver][sender], by_run)
+            masked = _mask_lost(inbox[receiver][sender], by_run)
             inbox[receiver][sender] = cast(P, masked)
         return inbox
 
@@ -241,11 +256,11 @@ class Channel:
         """
         graph = self.graph
         n_links = graph.senders.size
-        copies, scalars, bytes_ = count_payload(payloads, n_links, self.runs)
+        copies, scalars, bytes_ = _count_payloads(payloads, n_links, self.runs)
         sent = cast(list[P | None], copies)
         size = _Size(scalars, bytes_)
         if common is not None:
-            _, *of_agents = count_payload(common, graph.n_agents, self.runs)
+            _, *of_agents = _count_payloads(common, graph.n_agents, self.runs)
             size = _Size(scalars, bytes_, (of_agents[0], of_agents[1]))
         used = np.array([payload is not None for payload in sent], dtype=bool)
         arrived = self._transmit(used, size)
@@ -257,7 +272,7 @@ class Channel:
                 result.append(payload)
             else:
                 by_run = arrived[:, link].reshape(self.runs)
-                result.append(cast(P, mask_lost(payload, by_run)))
+                result.append(cast(P, _mask_lost(payload, by_run)))
         return result
 
     @validated
@@ -467,6 +482,8 @@ class Channel:
             arrived = self._transmit_rounds(1, used, size, acknowledged=acknowledged)
             return np.asarray(arrived[0])
         self._charge(used[None], size, acknowledged=acknowledged)
+        if self._n_drawn == 1:
+            return used[None]
         everywhere = np.broadcast_to(used, (self._n_drawn, used.size))
         return np.asarray(everywhere[self._drawn])
 
@@ -522,40 +539,150 @@ class Channel:
     ) -> None:
         """Enter the messages on links (rounds, E) of these sizes, some times, in both bills."""
         graph = self.graph
-        # How often each link, and each agent for all its links at once, has sent.
-        uses = repeated * used_by_round.sum(axis=0)
-        messages = self._count_by_agent(graph.senders, uses)
-        scalars = self._count_by_agent(graph.senders, uses * size.scalars)
-        bytes_ = self._count_by_agent(graph.senders, uses * size.bytes)
-        bills = [messages, scalars, bytes_]
-        if size.transmission is None:
-            bills += bills
-        else:
-            sends = repeated * self._count_transmissions(used_by_round)
-            bills += [sends, *[sends * part for part in size.transmission]]
-        if acknowledged:
-            # One byte back for each message, in the same round.
-            replies = self._count_by_agent(graph.receivers, uses)
-            for k in (0, 2, 3, 5):
-                bills[k] = bills[k] + replies
-        ledger = self.ledger
+        # Rounds that are entered later only add to it.
+        ledger = self._ledger
         totals: dict[str, Any] = {}
-        for name, amount in zip(_BILLS, bills, strict=True):
-            totals[name] = getattr(ledger, name) + np.asarray(amount, dtype=np.int64)
         # Without links there is no round.
         if graph.senders.size:
             totals["rounds"] = ledger.rounds + repeated * len(used_by_round)
+        bills = self._count_bills(used_by_round, size, acknowledged, repeated)
+        for name, amount in zip(_BILLS, bills, strict=True):
+            totals[name] = getattr(ledger, name) + amount
         self._ledger = ledger.replace(**totals)
+
+    def _count_bills(
+        self, used_by_round: Mask, size: _Size, acknowledged: bool, repeated: int
+    ) -> list[Counts]:
+        """Return what each agent sends, in the order of the ledger's fields."""
+        graph = self.graph
+        n_links = used_by_round.size
+        if (
+            size.is_common
+            and size.transmission is not None
+            and not acknowledged
+            and np.count_nonzero(used_by_round) == n_links
+        ):
+            # The usual case: every agent sends the same on all its links.
+            rounds = repeated * len(used_by_round)
+            messages = rounds * graph.messages_a_round
+            sends = rounds * graph.is_sender
+            scalars, bytes_ = size.transmission
+            links_bill = [messages, messages * scalars, messages * bytes_]
+            return [*links_bill, sends, sends * scalars, sends * bytes_]
+        # How often each link, and each agent for all its links at once, has sent.
+        uses = repeated * used_by_round.sum(axis=0)
+        by_link: list[Counts | Array] = []
+        for weights in (uses, uses * size.scalars, uses * size.bytes):
+            by_link.append(self._count_by_agent(graph.senders, weights))
+        by_agent = by_link
+        if size.transmission is not None:
+            sends = repeated * self._count_transmissions(used_by_round)
+            by_agent = [sends, *[sends * part for part in size.transmission]]
+        amounts = [np.asarray(n, dtype=np.int64) for n in (*by_link, *by_agent)]
+        if acknowledged:
+            # One byte back for each message, in the same round.
+            replies = np.asarray(self._count_by_agent(graph.receivers, uses), np.int64)
+            for k in (0, 2, 3, 5):
+                amounts[k] = amounts[k] + replies
+        return amounts
 
     def _count_transmissions(self, used_by_round: Mask) -> Counts:
         """Return in how many rounds each agent sends on any link, (A,)."""
         graph = self.graph
         if used_by_round.all():
-            return len(used_by_round) * (graph.out_degree > 0).astype(np.int64)
+            return len(used_by_round) * graph.is_sender
         sends = np.zeros(graph.n_agents, dtype=np.int64)
         for used in used_by_round:
             sends += self._count_by_agent(graph.senders[used]) > 0
         return sends
+
+
+def _count_payloads(
+    payloads: object, agents: int, runs: tuple[int, ...]
+) -> tuple[list[Payload | None], Counts, Counts]:
+    """Return read-only copies of the agents' payloads, and their scalars and bytes.
+
+    Entries that are NaN in all runs are not sent. A payload without any other entry is
+    silence, like None, and comes back as None.
+    """
+    if not isinstance(payloads, Sequence | np.ndarray) or len(payloads) != agents:
+        size = len(payloads) if hasattr(payloads, "__len__") else None
+        received = type(payloads).__name__ if size is None else size
+        raise InvalidArgumentError(
+            f"payloads must be a list with one entry for each of {agents} agents, got {received}"
+        )
+    n_runs = math.prod(runs)
+    sent: list[Payload | None] = [None] * agents
+    scalars = [0] * agents
+    bytes_ = [0] * agents
+    for agent, payload in enumerate(payloads):
+        # None is silence, which costs nothing.
+        if payload is None:
+            continue
+        is_tuple = type(payload) is tuple
+        parts = payload if is_tuple else (payload,)
+        if not parts:
+            raise ValueError(
+                f"payloads[{agent}] must have arrays, or None to stay silent, got ()"
+            )
+        # Copied even if the payload turns out to be silence: the checks come with it.
+        copies = [_copy_part(part, agent, runs) for part in parts]
+        silent = True
+        for part in copies:
+            count = part.size // n_runs
+            # A sum of squares is NaN only if an entry is, and takes half as long as np.isnan.
+            if part.dtype.kind == "f" and math.isnan(np.vdot(part, part)):
+                count = _count_present(part, n_runs)
+            scalars[agent] += count
+            bytes_[agent] += count * part.itemsize
+            # An empty array is a message without content, not silence.
+            silent = silent and count == 0 and part.size > 0
+        if not silent:
+            sent[agent] = tuple(copies) if is_tuple else copies[0]
+    return sent, np.array(scalars), np.array(bytes_)
+
+
+def _copy_part(part: object, agent: int, runs: tuple[int, ...]) -> Part:
+    """Return a read-only copy of an array, or refuse anything else."""
+    # A masked array's mask, or an object, could carry numbers that are not counted.
+    plain = part if isinstance(part, np.ndarray) else None
+    if isinstance(part, np.ma.MaskedArray):
+        plain = None
+    if plain is None or plain.dtype.kind not in "biuf":
+        name = type(part).__name__ if plain is None else f"dtype {plain.dtype}"
+        raise InvalidArgumentError(
+            f"payloads[{agent}] must be an array of real numbers, a flat tuple of them "
+            f"or None, got {name}"
+        )
+    if plain.shape[: len(runs)] != runs:
+        raise ValueError(
+            f"payloads[{agent}] must have leading axes {runs}, got shape {plain.shape}"
+        )
+    # The sender may go on computing in its own array.
+    copy: Part = np.array(plain)
+    copy.flags.writeable = False
+    return copy
+
+
+def _count_present(part: Part, n_runs: int) -> int:
+    """Return how many entries of one run are not NaN in all runs."""
+    present = ~np.isnan(part).reshape(n_runs, -1)
+    return int(present.any(axis=0).sum())
+
+
+def _mask_lost(payload: Payload, arrived: Mask) -> Payload:
+    """Return read-only copies of a payload with NaN in the runs that lost the message."""
+    if isinstance(payload, tuple):
+        return tuple([_mask_part(part, arrived) for part in payload])
+    return _mask_part(payload, arrived)
+
+
+def _mask_part(payload: Part, arrived: Mask) -> Part:
+    # One flag for each run, for all of the payload's other axes.
+    axes = (1,) * (payload.ndim - arrived.ndim)
+    masked = np.where(arrived.reshape(arrived.shape + axes), payload, np.nan)
+    masked.flags.writeable = False
+    return masked
 
 
 def _group_by_receiver(

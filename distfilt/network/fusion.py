@@ -11,9 +11,8 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from ..ensembles import mean, sample_covariance
+from ..ensembles import match_moments, mean, sample_covariance
 from ..gaussians import intersection_weights
-from ..gaussians.single import match_moments
 from ..linalg import cholesky, solve_lower, symmetrise
 from ..periods import Periods, wrap_differences
 from ..validation import (
@@ -44,11 +43,9 @@ __all__ = [
 
 def _find_uncertain(covs: Array) -> Mask:
     """Return which components have a variance, (d,); the others are constants known to all."""
-    variances = np.diagonal(covs, axis1=-2, axis2=-1).reshape(-1, covs.shape[-1])
-    is_uncertain: Mask = (variances != 0).any(axis=0)
     # A component with a covariance but no variance is left to the check of definiteness.
-    is_correlated = (covs != 0).reshape(-1, *covs.shape[-2:]).any(axis=(0, 1))
-    return np.asarray(is_uncertain | is_correlated)
+    rows = (covs != 0).reshape(-1, covs.shape[-1])
+    return np.asarray(rows.any(axis=0))
 
 
 def _check_definite_or_known(value: Array, name: str) -> None:
@@ -382,15 +379,18 @@ def intersect_ensembles(
     x = ensembles / unit
     means = mean(x)
     covs = sample_covariance(x)
-    # Singular if an ensemble has no more members than components.
-    check_positive_definite(covs, "ensembles")
     periods = channel.periods
     if scale is not None:
         periods = _scale_periods(periods, scale)
-    fused = _intersect((means, covs), channel, rule, rounds, periods)
-    # The affine map from the sample moments to the fused ones, in the given units
-    # again.
-    return match_moments(x, *fused) * unit
+    try:
+        fused = _intersect((means, covs), channel, rule, rounds, periods)
+        # The affine map from the sample moments to the fused ones, in the given units
+        # again.
+        return match_moments(x, *fused) * unit
+    except ValueError:
+        # Singular if an ensemble has no more members than components.
+        check_positive_definite(covs, "ensembles")
+        raise
 
 
 def _scale_periods(periods: Periods, scale: Array) -> Periods:
@@ -455,7 +455,7 @@ def _repeat(
     """Exchange means and upper triangles of covariances and fuse them, some times."""
     means, covs = belief
     is_uncertain = _find_uncertain(covs)
-    if not is_uncertain.all():
+    if np.count_nonzero(is_uncertain) < is_uncertain.size:
         return _repeat_uncertain(belief, channel, rounds, fuse, is_uncertain)
     return _repeat_all(belief, channel, rounds, fuse, channel.periods)
 

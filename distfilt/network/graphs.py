@@ -203,6 +203,16 @@ class Graph(FrozenModel):
         return np.bincount(self.senders, minlength=self.n_agents).astype(np.float64)
 
     @cached_property
+    def messages_a_round(self) -> Indices:
+        """Number of messages of each agent if it sends on all its links, (A,)."""
+        return self.out_degree.astype(np.int64)
+
+    @cached_property
+    def is_sender(self) -> Indices:
+        """One for an agent from which others receive, zero for others, (A,)."""
+        return (self.out_degree > 0).astype(np.int64)
+
+    @cached_property
     def is_directed(self) -> bool:
         """Whether some link goes one way only."""
         # The same structure as the transpose's; both have sorted columns.

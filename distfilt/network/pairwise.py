@@ -19,7 +19,14 @@ from ..gaussians import (
 )
 from ..linalg import symmetrise
 from ..periods import wrap_differences
-from ..validation import Array, ArrayInput, PositiveInt, PositiveSemidefinite, validated
+from ..validation import (
+    Array,
+    ArrayInput,
+    Mask,
+    PositiveInt,
+    PositiveSemidefinite,
+    validated,
+)
 from .channel import Channel, fusion_rule
 from .consensus import _warn_if_disconnected
 from .fusion import Gaussians, Pair, _Received, _repeat
@@ -200,7 +207,7 @@ def split_covariance_intersection(
 
 
 def _fuse_parts(
-    parts: list[Array], channel: Channel, arrived: Array, rule: Size
+    parts: list[Array], channel: Channel, arrived: Mask, rule: Size
 ) -> list[Array]:
     """Fuse means and parts of covariances (R, A, ...) with those that have arrived."""
     graph = channel.graph

@@ -177,7 +177,7 @@ class Sensor(FrozenModel):
         """Standard deviation of each number's noise, (m,)."""
         return np.asarray(np.sqrt(self.noise_cov.diagonal()))
 
-    @property
+    @cached_property
     def wraps(self) -> bool:
         """Whether differences of observations wrap: by `periods` or a function of one's own."""
         return bool(self.periods) or self.residual_function is not None

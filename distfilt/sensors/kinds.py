@@ -348,7 +348,7 @@ def _geometry(indices: Sequence[int], origin: Array | None) -> _Geometry:
 
 def _offset(x: Array, indices: Sequence[int], origin: Array) -> Array:
     """Return the vector from the sensor to the place that some components form."""
-    return _pick(x, indices) - origin
+    return np.asarray(x[..., list(indices)] - origin)
 
 
 def _norm(vectors: Array) -> Array:

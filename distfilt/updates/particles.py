@@ -317,11 +317,12 @@ def distinct_fraction(points: Array) -> Array:
     >>> distinct_fraction(np.stack([exact_first, exact_last]))
     array([1., 1.])
     """
-    n = points.shape[-2]
-    changes = (points[..., 1:, :] != points[..., :-1, :]).sum(axis=-2, keepdims=True)
-    component = changes.argmax(axis=-1, keepdims=True)
-    values = np.take_along_axis(points, component, axis=-1)[..., 0]
+    *lead, n, d = points.shape
+    # Components first, so that comparisons and sums run along all particles.
+    rows = np.ascontiguousarray(points.mT).reshape(-1, d, n)
+    changes = (rows[..., 1:] != rows[..., :-1]).sum(axis=-1)
+    chosen = rows[np.arange(len(rows)), changes.argmax(axis=-1)]
     # Of equal values, neighbours once they are sorted, one counts.
-    values = np.sort(values)
+    values = np.sort(chosen).reshape(*lead, n)
     increases = (values[..., 1:] > values[..., :-1]).sum(axis=-1)
     return np.asarray((1 + increases) / n)

@@ -56,9 +56,14 @@ from .checks import (
     check_probabilities,
     format_number,
 )
-from .decorators import call_user, check_signature, skip_validation, validated
+from .decorators import (
+    FrozenModel,
+    call_user,
+    check_signature,
+    skip_validation,
+    validated,
+)
 from .first_use import is_first_use
-from .frozen import FrozenModel
 from .optional import import_optional
 
 __all__ = [

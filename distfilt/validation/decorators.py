@@ -1,22 +1,31 @@
-"""Validation of a function's arguments by its annotations, and how nested calls skip it."""
+"""Validation by annotations: of a function's arguments, and of the fields of a frozen dataclass.
+
+Nested calls skip it, and so does a dataclass that the library constructs.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from contextvars import ContextVar
-from functools import cached_property, partial, wraps
-from inspect import Parameter, signature
+from dataclasses import fields
+from functools import cache, cached_property, partial, wraps
+from inspect import Parameter, get_annotations, signature
 from math import isfinite
-from typing import TypeVar, cast
+from typing import Any, ClassVar, Self, TypeVar, cast
+
+import numpy as np
 
 from .annotations import FINITE_FLOAT, ArgumentConstraint, CallContext
 from .checks import InvalidArgumentError
-from .resolving import make_constraints
+from .resolving import make_constraints, sort_arrays_last
 
 __all__ = [
+    "FrozenModel",
     "SignatureConstraints",
     "call_user",
     "check_signature",
+    "field_constraints",
     "skip_validation",
     "validated",
 ]
@@ -198,7 +207,7 @@ def validated(
     return cast(F, wrapper)
 
 
-class skip_validation:  # the name of a context manager is a verb
+class skip_validation:
     """Skip the checks of all validated functions, in a loop whose arguments are known to fit.
 
     Arrays must then be float64 arrays of the declared shapes, since nothing is converted either.
@@ -211,6 +220,7 @@ class skip_validation:  # the name of a context manager is a verb
     ...     wrap(np.array([4.0])).round(3)
     array([-2.283])
     """
+
     __slots__ = ("_token",)
 
     def __enter__(self) -> None:
@@ -265,3 +275,103 @@ def call_user(function: Callable[..., R], *args: object, **options: object) -> R
         return function(*args, **options)
     finally:
         _NESTED.reset(token)
+
+
+class FrozenModel:
+    """A base of frozen dataclasses whose constructors check the fields by their annotations.
+
+    Arrays are copied and kept read-only. A subclass with relations between its fields extends
+    `__post_init__`.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True, eq=False)
+    ... class Label(FrozenModel):
+    ...     text: str
+    ...     size: int
+    >>> Label("a", 1.5)
+    Traceback (most recent call last):
+    distfilt.validation.InvalidArgumentError: size must be an integer, got 1.5
+    """
+
+    is_validated: ClassVar[bool] = False
+    """Whether the constructor checked this instance; not if the library constructed it."""
+
+    def __post_init__(self) -> None:
+        cls: Any = type(self)
+        context = CallContext(dict(vars(self)))
+        # Shapes refer to fields by name, as they do to arguments in a call.
+        values = context.arguments
+        for name, constraint in field_constraints(cls).items():
+            value = constraint.validate(values[name], name, context)
+            values[name] = _freeze(value)
+        # A frozen dataclass has no __setattr__; its dictionary takes the converted values.
+        vars(self).update(values, is_validated=True)
+
+    @classmethod
+    def construct(cls, *args: object, **options: object) -> Self:
+        """Build an instance of values that the library made: nothing is checked or copied."""
+        # Past __init__, and so past the checks.
+        instance = object.__new__(cls)
+        dataclass: Any = cls
+        names, factories = _fields(dataclass)
+        values = vars(instance)
+        values.update(zip(names, args, strict=False), **options)
+        for name, factory in factories:
+            if name not in values:
+                values[name] = factory()
+        return instance
+
+    def replace(self, **changes: object) -> Self:
+        """Return a copy with other values in some fields, unchecked."""
+        cls: Any = type(self)
+        names, _ = _fields(cls)
+        values = {name: getattr(self, name) for name in names}
+        return self.construct(**values | changes)
+
+
+@cache
+def _fields(
+    cls: Any,
+) -> tuple[tuple[str, ...], tuple[tuple[str, Callable[[], object]], ...]]:
+    """Return the names of a dataclass's fields, and the factories of defaults by name.
+
+    A default that is no factory is an attribute of the class, so that instances need none.
+    """
+    names = []
+    factories = []
+    for item in fields(cls):
+        names.append(item.name)
+        # In a class that was sent to another process, "none" is a copy of MISSING.
+        if callable(item.default_factory):
+            factories.append((item.name, item.default_factory))
+    return tuple(names), tuple(factories)
+
+
+@cache
+def field_constraints(cls: Any) -> dict[str, ArgumentConstraint]:
+    """Return the constraints of a dataclass's fields, inherited ones included, arrays last."""
+    names, _ = _fields(cls)
+    constraints: dict[str, ArgumentConstraint] = {}
+    # Base classes first, so that a subclass may narrow the annotation of a field.
+    for base in reversed(cls.__mro__):
+        annotations = get_annotations(base)
+        declared = {name: annotations[name] for name in annotations if name in names}
+        module_names = vars(sys.modules.get(base.__module__, sys))
+        constraints |= make_constraints(
+            declared, base.__module__, module_names, base.__qualname__
+        )
+    return sort_arrays_last(constraints)
+
+
+def _freeze(value: object) -> object:
+    """Return a value with read-only copies of the arrays in it."""
+    if type(value) is tuple:
+        return tuple([_freeze(entry) for entry in value])
+    if not isinstance(value, np.ndarray):
+        return value
+    # The caller may change its own array later.
+    copy = value.copy()
+    copy.setflags(write=False)
+    return copy

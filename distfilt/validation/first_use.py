@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import weakref
 
-from .frozen import FrozenModel
+from .decorators import FrozenModel
 
 __all__ = ["is_first_use", "mark_checked", "needs_check"]
 

@@ -16,6 +16,7 @@ from ledger import (
     summaries,
     text_of,
 )
+from pages import claims_table
 
 HOME = {"paper": "grange", "item": "Fig. 1", "chapter": "04-satellite-network"}
 ITEM = {**HOME, "kind": "results", "title": "Error"}
@@ -94,6 +95,23 @@ def test_a_fitted_result_is_not_counted_as_a_match() -> None:
     fitted = {**VERDICT, "verdict": "fitted", "why": "14 numbers fitted to 9"}
     _, counts = summaries(ledger([ITEM], [fitted]))["results"]
     assert counts["fitted"] == 1 and counts["match"] == counts["differs"] == 0
+
+
+def test_claims_have_a_row_each_and_only_the_columns_that_they_need() -> None:
+    row = dict.fromkeys(COLUMNS, "") | {
+        "ours": "near fails: error 2 | 3 m; far holds: error 3",
+        "null": "near, a coin: 2; far, a coin: 9",
+    }
+    listed = {name: {"claim": f"It is {name}"} for name in ("near", "far")}
+    head, _, near, far, end = claims_table(claims_of(row), listed)
+    assert head == "| Claim | Verdict | Ours | If false |" and end == ""
+    # A bar within a cell must not end it.
+    assert near == r"| It is near | fails | error 2 \| 3 m | a coin: 2 |"
+    assert far == "| It is far | holds | error 3 | a coin: 9 |"
+    with_control = row | {"control": "near, no noise: 0"}
+    head, _, near, far, _ = claims_table(claims_of(with_control), listed)
+    assert head.endswith("| If true |") and near.endswith("| no noise: 0 |")
+    assert far.endswith("| – |")
 
 
 def test_a_row_gives_its_claims_with_their_evidence() -> None:

@@ -189,6 +189,55 @@ def test_the_correction_does_not_stretch_rounding() -> None:
         assert sizes[2] > 1e-6 * sizes[0]
 
 
+# ------------------------------------------------------------- the distance as the cost
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_with_the_distance_mass_stays_where_it_may(seed: int) -> None:
+    """By the triangle inequality min(w_i, 1/N) stays; the cost is that of the programme."""
+    x, logs, weights = _case(seed)
+    plan = coupling.transport_plans(x, logs, cost="distance")
+    staying = np.diagonal(plan)
+    assert np.abs(staying - np.minimum(weights, 1 / 40)).max() < 1e-15
+    distances = np.sqrt(coupling.squared_distances(x))
+    optimal = coupling.transport_plan(distances, weights)
+    # The addition that decides ties may cost 1e-7 of the range.
+    assert abs((plan * distances).sum() - optimal.value) < 1e-7 * distances.max()
+    by_square = coupling.transport_plans(x, logs)
+    assert (by_square * distances).sum() > 1.01 * optimal.value
+    transformed = coupling.transform_ensemble(x, logs, cost="distance")
+    assert np.allclose(transformed, 40 * plan.T @ x, rtol=0, atol=1e-12)
+
+
+def test_copies_do_not_leave_the_choice_to_rounding_with_the_distance() -> None:
+    """Ten coinciding members, perturbed by rounding, give the same plan."""
+    x, logs, _ = _case(6)
+    # Most pairs coincide.
+    x[:30] = x[0]
+    reference = coupling.transport_plans(x, logs, cost="distance")
+    for seed in range(5):
+        rounding = 1e-15 * _rng(seed).standard_normal(x.shape)
+        perturbed = x * (1 + rounding)
+        plan = coupling.transport_plans(perturbed, logs, cost="distance")
+        assert np.abs(plan - reference).max() < 1e-9
+
+
+def test_the_loss_of_spread_vanishes_for_the_square_only() -> None:
+    """With the distance averages mix mass from far apart however many members there are."""
+    lost = {}
+    for n in (50, 400):
+        x = _rng(n).standard_normal((n, 2))
+        logs = -2 * (1.0 - x[:, 0]) ** 2
+        weights = np.exp(logs) / np.exp(logs).sum()
+        before = np.trace(_covariance(x, weights))
+        for cost in ("squared", "distance"):
+            after = coupling.transform_ensemble(x, logs, cost=cost)
+            lost[cost, n] = 1 - np.trace(_covariance(after)) / before
+    assert lost["squared", 400] < 0.4 * lost["squared", 50]
+    assert lost["distance", 400] > 0.6 * lost["distance", 50]
+    assert lost["distance", 400] > 5 * lost["squared", 400]
+
+
 # ------------------------------------------------------------- entropy and rejuvenation
 
 

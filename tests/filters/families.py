@@ -63,6 +63,11 @@ RULES = {
         network.naive_fusion,
         network.arithmetic_average,
         partial(network.consensus_pull, gain=0.1),
+        network.inverse_covariance_intersection,
+        network.ellipsoidal_intersection,
+        network.covariance_union,
+        network.information_consensus,
+        network.diffuse_means,
     ],
     "common": [network.average_consensus, partial(network.average_consensus, gain=0.2)],
 }

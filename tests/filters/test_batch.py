@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
+from distfilt.ensembles import match_moments
 from distfilt.filters import (
     EnsembleFilter,
     GaussianFilter,
@@ -16,7 +17,6 @@ from distfilt.filters import (
     MixtureFilter,
     Observation,
 )
-from distfilt.gaussians.single import match_moments
 from distfilt.models import LinearModel
 from distfilt.network import Graph
 from distfilt.sensors import Sensor, component

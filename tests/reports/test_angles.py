@@ -38,7 +38,15 @@ from distfilt.filters import (
 from distfilt.mixtures import GaussianMixture, target_fusion
 from distfilt.models import LinearModel, Model, pendulum_angle
 from distfilt.network import Channel, graphs
-from distfilt.sensors import Sensor, bearing, component, increment, stack, wrap
+from distfilt.sensors import (
+    Sensor,
+    bearing,
+    component,
+    increment,
+    line_angle,
+    stack,
+    wrap,
+)
 from distfilt.updates import (
     enkf_exact,
     etkf,
@@ -527,6 +535,39 @@ def test_a_transition_that_wraps_undeclared_warns_once(family: str) -> None:
     assert abs(wrap(f.summarize(state).mean[0, 0] - want)) < tolerance(family)
 
 
+def test_angles_over_more_than_half_a_period_follow_the_tangent() -> None:
+    """A point at (3, 3) ± 5 and the angle of a line, 1.2: regressions have the tangent's sign.
+
+    Predictions near that of the mean, one by one, gave the opposite sign: points beyond the
+    jump of the angle counted on the wrong side.
+    """
+    still_point = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
+    prior = [3.0, 3.0], 25.0 * np.eye(2)
+    sensor = line_angle((0, 1), std=0.2)
+    filters = {
+        "unscented": GaussianFilter(still_point, [sensor], linearization="unscented"),
+        "ensemble": EnsembleFilter(still_point, [sensor], members=20_000),
+    }
+    # By hand: the slope of the tangent is (-1, 1) / 6, so that its standard deviation,
+    # 5 √2 / 6 = 1.18, is less than half a period, and the mean moves along (-1, 1).
+    for name, f in filters.items():
+        state = f.step(start(f, *prior), 1.0, [[1.2]])
+        y, z = f.summarize(state).mean[0]
+        assert y < 2.5 and z > 3.5, name
+        # The exact direction is 1.17, that of the prior's mean 0.79.
+        assert 1.0 < np.arctan2(z, y) < 1.2, name
+
+
+def test_near_a_singularity_the_branch_is_that_of_the_mean() -> None:
+    """There the tangent turns many times among the points, and the update must not collapse."""
+    still_point = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
+    f = EnsembleFilter(still_point, [line_angle((0, 1), std=0.2)], members=2000)
+    state = f.step(start(f, [0.3, 0.3], 25.0 * np.eye(2)), 1.0, [[1.2]])
+    # Along (-1, 1) the tangent has a slope of 2.4 rad a metre, the angle itself hardly any.
+    across = state.ensembles[0] @ [-1.0, 1.0] / np.sqrt(2)
+    assert across.std() > 3.0
+
+
 def test_a_truth_that_wraps_undeclared_warns() -> None:
     """Case d06 without periods."""
     times = np.arange(1.0, 21.0)
@@ -539,6 +580,22 @@ def test_a_truth_that_wraps_undeclared_warns() -> None:
         f.run(state, times, [wrap(truth)], truth=truth)
     with pytest.warns(RuntimeWarning, match="whole turns.*periods="):
         f.run(state, times, [wrap(truth)], truth=wrap(truth))
+
+
+def test_a_large_first_error_is_no_wrap() -> None:
+    """A position that is 9 m wrong falls by 2π m in one step, as a filter finds its place."""
+    still_point = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    f = GaussianFilter(still_point, [stack([component([0], std=1.0), compass()])])
+    truth = np.zeros((120, 1))
+    # Nothing at the first time, then the position 0 with a gain of 0.698 = 2π / 9.
+    observed = np.full((120, 2), np.nan)
+    observed[1:, 0] = 0.0
+    variance = TURN / (9.0 - TURN)
+    state = f.start(([9.0], [[variance]]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run = f.run(state, np.arange(1.0, 121.0), [observed], truth=truth)
+    assert abs(run["mean"].values[1].item() - (9.0 - TURN)) < 1e-12
 
 
 def test_what_does_not_wrap_is_not_warned_of() -> None:

@@ -71,9 +71,7 @@ def _two_pi_steps(
 ) -> network.PIState:
     state = network.pi_start(values)
     for channel in channels:
-        state = network.pi_step(
-            state, values, channel, dt=0.1, alpha=1.0, a=1.0, b=1.0
-        )
+        state = network.pi_step(state, values, channel, dt=0.1, alpha=1.0, a=1.0, b=1.0)
     return state
 
 

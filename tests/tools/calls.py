@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any
 
 import distfilt
-from distfilt.validation import FrozenModel, decorators, frozen
+from distfilt.validation import FrozenModel, decorators
 
 MAX_CALLS = 4
 """Calls that are recorded of one function."""
@@ -29,7 +29,7 @@ def describe(thing: Any) -> dict[str, Any]:
             return {}
         # A constructor of its own may take some of the fields only.
         parameters = inspect.signature(thing).parameters
-        constraints = frozen.field_constraints(thing)
+        constraints = decorators.field_constraints(thing)
         return {name: kind for name, kind in constraints.items() if name in parameters}
     return (
         dict(thing.signature_constraints.constraints)

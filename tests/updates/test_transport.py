@@ -140,3 +140,16 @@ def test_nothing_is_drawn_without_rejuvenation() -> None:
     # Rejuvenation follows the transform, with the same generator.
     expected = coupling.rejuvenate(transformed, x, bandwidth=0.2, rng=rng_of(1))
     assert np.array_equal(first, expected)
+
+
+def test_the_distance_is_handed_on_as_the_cost() -> None:
+    """The members are those of the transform with this cost, and not those of the square."""
+    x = members(30)
+    h = x @ H.T
+    transformed = etpf(x, h, Y, R, rng=rng_of(), cost="distance")
+    residual = Y - h
+    solved = np.linalg.solve(R, residual.T).T
+    logs = -0.5 * (residual * solved).sum(axis=1)
+    expected = coupling.transform_ensemble(x, logs, cost="distance")
+    assert np.abs(transformed - expected).max() < 1e-12
+    assert np.abs(transformed - etpf(x, h, Y, R, rng=rng_of())).max() > 1e-3

@@ -33,12 +33,13 @@ PAPERS = ("grange", "das", "semeraro", "zheng", "together")
 
 VERDICTS = {
     "parameters": ("read", "differs", "not comparable"),
-    "results": ("match", "differs", "not comparable"),
+    "results": ("match", "differs", "not comparable", "fitted"),
 }
 """Possible verdicts on each kind of item.
 
 A table of parameters is "read" by a study; results "match" or not. Reading parameters reproduces no
-result. An item without a verdict is "not yet" in the ledger.
+result. Results are "fitted" if our input was chosen to give the printed numbers: their agreement
+shows that such an input exists, and no more. An item without a verdict is "not yet" in the ledger.
 """
 
 _MIME = "application/vnd.distfilt.verdict+json"
@@ -104,15 +105,18 @@ class Verdict:
     ----------
     paper, item : str
         One of `items`.
-    verdict : {"read", "match", "differs", "not comparable"}
-        The finding: "read" only for an item of kind "parameters", "match" only for results.
+    verdict : {"read", "match", "differs", "not comparable", "fitted"}
+        The finding: "read" only for an item of kind "parameters", "match" and "fitted" only for
+        results.
     ours, published : str
         Our result, and the printed one.
     why : str
-        The reason, or the input that the paper does not give; required if the item differs or is
-        not comparable.
+        The reason, the input that the paper does not give, or the numbers that were fitted;
+        required unless the item matches or is read.
     null : str
         The numbers that would result if the claims were false; the rules fail on them.
+    control : str
+        The numbers of a case in which the claims are true; the rules hold for them.
     range : str
         Values of unprinted parameters for which the verdict holds.
 
@@ -132,6 +136,7 @@ class Verdict:
     why: str = ""
     null: str = ""
     range: str = ""
+    control: str = ""
 
     def __post_init__(self) -> None:
         # "match" must not be possible for a table that is only read.
@@ -144,7 +149,7 @@ class Verdict:
             raise ValueError(f"why must give a reason for {self.verdict!r}")
 
     def _fields(self) -> list[tuple[str, str]]:
-        names = ("ours", "null", "range", "published", "why")
+        names = ("ours", "null", "control", "range", "published", "why")
         return [(name, getattr(self, name)) for name in names if getattr(self, name)]
 
     def __str__(self) -> str:
@@ -177,13 +182,19 @@ def _judge(
     study: Scenario | None,
     *,
     open_: str = "",
+    fitted: str = "",
     **evidence: str,
 ) -> Verdict:
     """Return the verdict; a changed scenario or an open input makes it "not comparable"."""
     # A changed scenario comes before any other reason.
     if study is not None and study.changes:
         open_ = "changed scenario: " + "; ".join(study.changes)
-    if open_:
+        fitted = ""
+    if fitted:
+        # Neither a match nor a difference: the input was chosen for the printed numbers.
+        verdict = "fitted"
+        reason = fitted
+    elif open_:
         verdict = "not comparable"
         reason = open_
     elif good:
@@ -214,6 +225,10 @@ class Claim(NamedTuple):
         Whether the criterion fails on the null's numbers, as it must.
     range : str
         Values of an unprinted parameter for which the claim holds.
+    control : str
+        The numbers of a case in which the claim is true, and how they were computed.
+    can_hold : bool
+        Whether the criterion holds for the control's numbers, as it must.
 
     Examples
     --------
@@ -228,6 +243,8 @@ class Claim(NamedTuple):
     null: str = ""
     has_power: bool = True
     range: str = ""
+    control: str = ""
+    can_hold: bool = True
 
     @classmethod
     def from_rule(
@@ -241,8 +258,13 @@ class Claim(NamedTuple):
         *,
         range: str = "",
         shown: Callable[[Any], str] = str,
+        control: Any = None,
+        control_case: str = "",
     ) -> Claim:
         """Judge a claim by one rule, on our number and on its null, which `against` describes.
+
+        A claim that fails should have a positive `control`: the number of a case, described by
+        `control_case`, in which the claim is true.
 
         Examples
         --------
@@ -255,9 +277,17 @@ class Claim(NamedTuple):
         """
         # The same rule on the null's number: a rule that passes both has no power.
         null_text = f"{against}: {shown(null)}{' (holds too)' if rule(null) else ''}"
-        return cls(
+        claim = cls(
             id, text, bool(rule(ours)), shown(ours), null_text, not rule(null), range
         )
+        if control is None:
+            return claim
+        # A rule that rejects the control too could never have held.
+        accepted = bool(rule(control))
+        control_text = (
+            f"{control_case}: {shown(control)}{'' if accepted else ' (fails too)'}"
+        )
+        return claim._replace(control=control_text, can_hold=accepted)
 
     def __str__(self) -> str:
         return f"{self.id} {'holds' if self.holds else 'fails'}: {self.text} {self.evidence}"
@@ -270,6 +300,7 @@ def judge_claims(
     *,
     why: str = "",
     free: str = "",
+    fitted: str = "",
     scenario: Scenario | None = None,
 ) -> Verdict:
     """Return the verdict on a figure: a match if every claim listed for it holds.
@@ -286,13 +317,17 @@ def judge_claims(
     free : str
         An unprinted input on which the verdict depends, so that it is "not comparable"; the claims'
         ranges give the values for which they hold.
+    fitted : str
+        How many free numbers were fitted to how many printed ones, if our input was chosen to give
+        them. The verdict is then "fitted", whether the claims hold or not.
     scenario : Scenario, optional
         The scenario of the study. If it is not the paper's, the verdict is "not comparable" and
         names the changes.
 
     Notes
     -----
-    If all claims hold and a criterion passes on its null too, the verdict is "not comparable".
+    If all claims hold and a criterion passes on its null too, the verdict is "not comparable"; also
+    if a claim fails and its criterion rejects its control too.
 
     Examples
     --------
@@ -333,7 +368,12 @@ def judge_claims(
     # A rule that its null passes too shows nothing.
     if all_hold and powerless and not free:
         free = f"the rule of {', '.join(powerless)} holds for its null too"
+    # Nor does a failure if the rule rejects a case in which the claim is true.
+    unable = [c.id for c in claims if not c.holds and not c.can_hold]
+    if unable and not free:
+        free = f"the rule of {', '.join(unable)} fails for its control too"
     null = "; ".join(f"{c.id}, {c.null}" for c in claims if c.null)
+    control = "; ".join(f"{c.id}, {c.control}" for c in claims if c.control)
     ranges = "; ".join(f"{c.id} {c.range}" for c in claims if c.range)
     return _judge(
         listed_item,
@@ -343,7 +383,9 @@ def judge_claims(
         why,
         scenario,
         open_=free,
+        fitted=fitted,
         null=null,
+        control=control,
         range=ranges,
     )
 

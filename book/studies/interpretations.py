@@ -15,12 +15,14 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import _satellites as satellites
 
-NAME = "readings"
+NAME = "interpretations"
 PAPER = "grange"
 BATCH = 5
+# ω = sqrt(μ / a³) of the printed orbit, a = 8.413e6 m
 ORBIT = float(np.sqrt(3.986004418e14 / 8.413e6**3))
 SETUP = satellites.setup("table-2")
 SETUPS = {"printed": SETUP, "orbit": satellites.setup("table-2", orbital_rate=ORBIT)}
+# What is left of the noise in the predicted observations
 FACTORS = {"none": 0.0, "hundredth": 0.01}
 VERSIONS = {"bare": False, "pca": True}
 NAMES = [
@@ -38,9 +40,11 @@ max_outliers = 2
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """Run a batch under every interpretation, on the same data at each rate."""
+    # Every filter of a batch has the same data and draws of its own.
     for_data, for_filters = seed.spawn(2)
     values: dict[str, float] = {}
     for rate, s in SETUPS.items():
+        # The text speaks of integrating an ODE: a truth without process noise.
         truth, seen = satellites.draw_data(
             s, np.random.default_rng(for_data), (BATCH,), noisy=False
         )
@@ -74,6 +78,7 @@ def part(seed: np.random.SeedSequence) -> dict[str, float]:
 code = (
     satellites.draw_data,
     satellites.paper_filter,
+    satellites.align_each,
     satellites.noise_free_update,
     satellites.score_runs,
 )

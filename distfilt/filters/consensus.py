@@ -1,0 +1,203 @@
+"""Kalman filters whose agents average the information of their observations over the network."""
+
+from __future__ import annotations
+
+from dataclasses import KW_ONLY, dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from ..linalg import solve_definite, symmetrise
+from ..network.information import (
+    from_information,
+    pack_information,
+    to_information,
+    unpack_information,
+)
+from ..periods import fold
+from ..validation import Array, PositiveFloat
+from .gaussian import GaussianFamily, GaussianState
+from .options import FusesBeliefs
+from .step import Received, Step
+
+__all__ = ["InformationConsensusFilter"]
+
+
+@dataclass(frozen=True, eq=False)
+class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
+    r"""Kalman filters that average information matrices and vectors by a consensus rule.
+
+    Agent i forecasts :math:`\boldsymbol\Omega_i=\mathbf P_i^{-1}` and has of its own observations
+    the information :math:`\delta\boldsymbol\Omega_i=\mathbf H_i^\top\mathbf R_i^{-1}\mathbf H_i`.
+    With averages :math:`\langle\cdot\rangle` by the consensus rule, and a weight ω,
+
+    .. math:: \boldsymbol\Omega_i^+ =
+        \begin{cases}
+        \boldsymbol\Omega_i+\omega\langle\delta\boldsymbol\Omega\rangle & \text{"measurements"}\\
+        \langle\boldsymbol\Omega\rangle+\omega\langle\delta\boldsymbol\Omega\rangle
+        & \text{"hybrid"}\\
+        A\,\langle\boldsymbol\Omega/A+\delta\boldsymbol\Omega\rangle & \text{"weighted"}
+        \end{cases}
+
+    and the same for the vectors. As an average times A is a sum, all of them with ω = A are the
+    Kalman filter of all observations if the averages are exact, whatever model and noise. They
+    differ after few rounds: "measurements" leaves forecasts apart, so that an agent may not learn
+    what its own observations do not show; "hybrid" with ω = 1 never counts information twice
+    (consensus on information); "weighted" is "hybrid" with ω = A for half of the numbers.
+
+    Parameters
+    ----------
+    model, sensors, graph, gate_probability, faults, names
+        As for :class:`~distfilt.filters.SensorFilter`. Where nobody can send, each agent uses its
+        own observations only.
+    fusion : callable
+        The consensus rule, ``fusion(values, channel) -> values`` for vectors, such as
+        ``partial(average_consensus, rounds=5)`` or ``finite_time_consensus``; required.
+    average : {"weighted", "hybrid", "measurements"}
+        Which information is averaged: d(d+3)/2 numbers, twice as many for "hybrid".
+    weight : float, optional
+        The weight ω for "hybrid" and "measurements"; the number A of agents by default.
+    on_error, record_evidence
+        As in :mod:`distfilt.filters.options`.
+    linearization, kappa, inflation
+        As for :class:`GaussianFilter`.
+
+    Notes
+    -----
+    "hybrid" and "measurements": G. Battistelli, L. Chisci, G. Mugnai, A. Farina and A. Graziano,
+    IEEE Transactions on Automatic Control 60 (2015) 1410-1415. "weighted": A. T. Kamal, J. A.
+    Farrell and A. K. Roy-Chowdhury, IEEE Transactions on Automatic Control 58 (2013) 3112-3125.
+
+    Examples
+    --------
+    >>> from distfilt.models import Model
+    >>> from distfilt.network import finite_time_consensus, graphs
+    >>> from distfilt.sensors import component
+    >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    >>> f = InformationConsensusFilter(
+    ...     still,
+    ...     [component([0], std=1.0)] * 4,
+    ...     graphs.ring(4),
+    ...     fusion=finite_time_consensus,
+    ... )
+    >>> state = f.step(f.start(([0.0], [[1.0]])), 0.0, [[1.0], [2.0], [3.0], [4.0]])
+    >>> state.means.ravel().round(6), (1 / state.covariances).ravel().round(6)
+    (array([2., 2., 2., 2.]), array([5., 5., 5., 5.]))
+    """
+
+    _: KW_ONLY
+    average: Literal["weighted", "hybrid", "measurements"] = "weighted"
+    weight: PositiveFloat | None = None
+
+    belief_kind: ClassVar[str | None] = "vectors"
+
+    def check_parts(self) -> None:
+        """Refuse a filter without a consensus rule, or with a weight that is not used."""
+        super().check_parts()
+        if self.fusion is None:
+            raise ValueError(
+                "fusion must be a consensus rule, such as partial(average_consensus, "
+                "rounds=5), got None"
+            )
+        if self.weight is not None and self.average == "weighted":
+            raise ValueError(
+                "weight must be None for the average 'weighted', which has none, got "
+                f"{self.weight:g}"
+            )
+
+    def next_state(self, step: Step[GaussianState]) -> GaussianState:
+        """Forecast, average the information, add it."""
+        means, covs = self._check_forecast(step)
+        # All agents' angles on one branch, so that vectors can be averaged.
+        branch = fold(means, self.periods)
+        gained = np.zeros((*branch.shape, branch.shape[-1] + 1))
+        for _, group in step.received():
+            self._add_information(gained, means, branch, covs, group, step)
+        own = pack_information(gained[..., :-1], gained[..., -1])
+        if not step.has_fusion:
+            new = self._add(step, branch, covs, own)
+        elif self.average == "measurements":
+            (averaged,) = step.fuse(own)
+            new = self._add(step, branch, covs, self._omega * averaged)
+        else:
+            total = self._total(step, branch, covs, own)
+            new = self._solve(step, branch, covs, total)
+        return self._end(step, *new)
+
+    @property
+    def _omega(self) -> float:
+        return float(self.n_agents) if self.weight is None else self.weight
+
+    def _total(
+        self, step: Step[GaussianState], means: Array, covs: Array, own: Array
+    ) -> Array:
+        """Return the packed information of forecasts and observations after the consensus."""
+
+        def compute(m: Array, p: Array, *_: Any) -> tuple[Array]:
+            return (pack_information(*to_information(m, p)),)
+
+        agents = range(self.n_agents)
+        (prior,) = step.apply(compute, (means, covs), (own,), agents)
+        if self.average == "weighted":
+            # A ⟨Ω / A + δΩ⟩
+            (averaged,) = step.fuse(prior / self.n_agents + own)
+            return self.n_agents * averaged
+        (averaged,) = step.fuse(np.concatenate([prior, own], axis=-1))
+        half = own.shape[-1]
+        # ⟨Ω⟩ + ω ⟨δΩ⟩
+        return np.asarray(averaged[..., :half] + self._omega * averaged[..., half:])
+
+    def _solve(
+        self, step: Step[GaussianState], means: Array, covs: Array, total: Array
+    ) -> tuple[Array, ...]:
+        """Return the Gaussians that have this information."""
+        d = means.shape[-1]
+
+        def compute(numbers: Array, *_: Any) -> tuple[Array, Array]:
+            return from_information(*unpack_information(numbers, d))
+
+        return step.apply(compute, (total,), (means, covs), range(self.n_agents))
+
+    def _add(
+        self, step: Step[GaussianState], means: Array, covs: Array, gained: Array
+    ) -> tuple[Array, ...]:
+        """Return the Gaussians with information added; components may be known constants."""
+        d = means.shape[-1]
+
+        def compute(m: Array, p: Array, numbers: Array, *_: Any) -> tuple[Array, Array]:
+            j, v = unpack_information(numbers, d)
+            # P⁺ = (I + P J)⁻¹ P and m⁺ = m + P⁺ (v - J m)
+            new = symmetrise(np.asarray(np.linalg.solve(np.eye(d) + p @ j, p)))
+            change = new @ (v[..., None] - j @ m[..., None])
+            return m + change[..., 0], new
+
+        return step.apply(
+            compute, (means, covs, gained), (means, covs), range(self.n_agents)
+        )
+
+    def _add_information(
+        self,
+        gained: Array,
+        means: Array,
+        branch: Array,
+        covs: Array,
+        group: Received,
+        step: Step[GaussianState],
+    ) -> None:
+        """Write Hᵀ R⁻¹ [H, y - h(m) + H m] of a group's own observations, in place."""
+        rows = group.rows
+        mean = means[..., rows, :]
+        cov = covs[..., rows, :, :]
+        group, predicted, slope, extra = self._predict(mean, cov, group, step)
+        innovation = group.target - predicted
+        missing = np.isnan(innovation)
+        # A missing component has a row of zeros, and a unit variance of its own.
+        slope = np.where(missing[..., None], 0.0, slope)
+        innovation = np.where(missing, 0.0, innovation)
+        noise = group.noise if extra is None else group.noise + extra
+        is_pair = ~missing[..., :, None] & ~missing[..., None, :]
+        noise = np.where(is_pair, noise, np.eye(noise.shape[-1]))
+        # z = y - h(m) + H m is linear in the state.
+        z = innovation[..., None] + slope @ branch[..., rows, :, None]
+        right = np.concatenate([slope, z], axis=-1)
+        gained[..., rows, :, :] = slope.mT @ solve_definite(noise, right)

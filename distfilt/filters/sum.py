@@ -1,0 +1,320 @@
+"""Gaussian sum filters: a bank of Kalman filters, weighted by how well they predict."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+
+from ..gaussians.single import condition
+from ..linalg import cholesky, log_det, log_sum_exp, quadratic_form, symmetrise
+from ..periods import settle
+from ..validation import Array
+from .base import SensorFilter
+from .gaussian import GaussianFamily, GaussianState
+from .options import SharesObservations
+from .priors import Prior, prior_mixtures
+from .record import Summary
+from .resets import Reset
+from .states import SensorState
+from .step import Received, Step
+
+__all__ = ["GaussianSumFilter", "GaussianSumState"]
+
+_LEAST = -700.0
+"""The smallest logarithm of a weight."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class GaussianSumState(SensorState):
+    """The agents' Gaussian mixtures between two steps, of equally many components.
+
+    Parameters
+    ----------
+    t, ledger, rng, rejected, failed, pending
+        As for :class:`~distfilt.filters.SensorState`; `rng` is None, as nothing is drawn.
+    component_means : ndarray, (*runs, A, L, d)
+    component_covariances : ndarray, (*runs, A, L, d, d)
+    log_weights : ndarray, (*runs, A, L)
+
+    Examples
+    --------
+    >>> from distfilt.network import Ledger
+    >>> state = GaussianSumState(
+    ...     0.0,
+    ...     Ledger.empty(1),
+    ...     None,
+    ...     np.array([[[0.0], [2.0]]]),
+    ...     np.ones((1, 2, 1, 1)),
+    ...     np.log([[0.5, 0.5]]),
+    ... )
+    >>> state.means, state.covariances
+    (array([[1.]]), array([[[2.]]]))
+    """
+
+    component_means: Annotated[Array, "... A L d"]
+    component_covariances: Annotated[Array, "... A L d d"]
+    log_weights: Annotated[Array, "... A L"]
+
+    belief_field = "component_means", (..., "A", "L", "d")
+
+    @property
+    def dim(self) -> int:
+        """Size d of one state."""
+        return int(self.component_means.shape[-1])
+
+    @cached_property
+    def weights(self) -> Array:
+        """The weights of the components, (*runs, A, L)."""
+        return np.asarray(np.exp(self.log_weights))
+
+    @property
+    def means(self) -> Array:
+        """Means of the whole mixtures, (*runs, A, d)."""
+        return _mix(self.weights, self.component_means, self.component_covariances)[0]
+
+    @property
+    def covariances(self) -> Array:
+        """Covariances of the whole mixtures, (*runs, A, d, d)."""
+        return _mix(self.weights, self.component_means, self.component_covariances)[1]
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
+    r"""A bank of Kalman filters for each agent, for a belief with several peaks or curvature.
+
+    The prior is a mixture. Every component is forecast and updated as by a
+    :class:`GaussianFilter`, and its weight multiplied by the density of the observations under
+    its own prediction,
+
+    .. math:: w_l^+\propto w_l\,N(\mathbf y;\mathbf h(\mathbf m_l),
+        \mathbf H_l\mathbf P_l\mathbf H_l^\top+\mathbf R)
+
+    For linear models and sensors the mixture is exact. The narrower the components, the closer to
+    exact it is for others. Their number stays the same.
+
+    Parameters
+    ----------
+    model, sensors, graph, gate_probability, faults, names
+        As for :class:`~distfilt.filters.SensorFilter`. The gate tests an observation against the
+        whole mixture's prediction.
+    share_observations, hops, on_error, record_evidence
+        As in :mod:`distfilt.filters.options`.
+    linearization, kappa, inflation
+        As for :class:`GaussianFilter`.
+
+    Notes
+    -----
+    D. L. Alspach and H. W. Sorenson, IEEE Transactions on Automatic Control 17 (1972) 439-448. A
+    prior of several components comes from :func:`distfilt.mixtures.split_gaussian`. A component
+    whose prediction of an observation does not exist (NaN) loses its weight, unless none can
+    predict it. Agents that fuse mixtures: :class:`MixtureFilter`.
+
+    Examples
+    --------
+    Is it left or right of a sensor that measures the distance?
+
+    >>> from distfilt.mixtures import split_gaussian
+    >>> from distfilt.models import Model
+    >>> from distfilt.sensors import Sensor
+    >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    >>> f = GaussianSumFilter(still, [Sensor(1, np.abs, [[0.01]])])
+    >>> prior = split_gaussian([0.2], [[1.0]], parts=20)
+    >>> state = f.step(f.start(prior), 0.0, [[1.0]])
+    >>> is_left = state.component_means[0, :, 0] < 0
+    >>> # By Bayes' rule 1 / (1 + exp(0.4)) = 0.40
+    >>> round(float(state.weights[0, is_left].sum()), 2)
+    0.4
+    """
+
+    state_class: ClassVar[type[Any]] = GaussianSumState
+
+    def initial_state(
+        self, prior: Prior, runs: tuple[int, ...], rng: Any
+    ) -> dict[str, Any]:
+        """Return the components of the prior, the same for all runs."""
+        mixtures = prior_mixtures(prior, self.model.dim, self.n_agents)
+        counts = {mixture.n_components for mixture in mixtures}
+        if len(counts) > 1:
+            raise ValueError(
+                "prior must have equally many components for all agents, got "
+                f"{sorted(counts)}"
+            )
+        arrays = {
+            "component_means": np.array([mixture.means for mixture in mixtures]),
+            "component_covariances": np.array([mixture.covs for mixture in mixtures]),
+            "log_weights": np.log([np.exp(_LEAST) + m.weights for m in mixtures]),
+        }
+        return {
+            name: np.broadcast_to(value, (*runs, *value.shape)).copy()
+            for name, value in arrays.items()
+        }
+
+    def reset_belief(self, state: Any, reset: Reset) -> Any:
+        """Refuse a reset, for which mixtures have no rule."""
+        return SensorFilter.reset_belief(self, state, reset)
+
+    def next_state(self, step: Step[Any]) -> Any:
+        """Forecast all components, condition and weight them by the observations."""
+        means, covs = self._forecast_components(step)
+        log_weights = step.keep_failed(step.state.log_weights, 0.0).copy()
+        for _, group in step.received():
+            self._condition_components(means, covs, log_weights, group, step)
+        if self.periods:
+            # A mixture lies on one branch of each circle.
+            means = settle(means, self.periods, np.exp(log_weights))
+        return step.end(
+            component_means=means,
+            component_covariances=symmetrise(covs),
+            log_weights=log_weights,
+        )
+
+    def summarize(self, state: Any) -> Summary:
+        """Return moments of the mixtures, and the effective numbers of their components."""
+        mean, cov = _mix(
+            state.weights, state.component_means, state.component_covariances
+        )
+        mean = state.mask_failed(mean)
+        cov = state.mask_failed(cov)
+        size = state.mask_failed(1 / (state.weights**2).sum(axis=-1))
+        variance = np.diagonal(cov, axis1=-2, axis2=-1)
+        return Summary(mean, variance, cov, numbers={"effective_size": size})
+
+    def _forecast_components(self, step: Step[Any]) -> tuple[Array, Array]:
+        """Return the components' forecasts, (*runs, A, L, ...)."""
+        state = step.state
+        # Components stand among the runs, before the agents.
+        bank = copy(step)
+        bank.state = GaussianState.construct(
+            state.t,
+            state.ledger,
+            None,
+            joint_means=state.component_means.swapaxes(-3, -2),
+            joint_covariances=state.component_covariances.swapaxes(-4, -3),
+            dim=state.dim,
+        )
+        means, covs = self._forecast(bank)
+        means = np.array(means.swapaxes(-3, -2))
+        covs = np.array(covs.swapaxes(-4, -3))
+        # Failed runs get harmless Gaussians, so that the batch can go on.
+        unit = np.eye(state.dim)
+        return step.check_forecast(means, 0.0), step.check_forecast(covs, unit)
+
+    def _condition_components(
+        self,
+        means: Array,
+        covs: Array,
+        log_weights: Array,
+        group: Received,
+        step: Step[Any],
+    ) -> None:
+        """Condition and weight the components of a group's agents, in place."""
+        rows = group.rows
+        mean = means[..., rows, :, :]
+        cov = covs[..., rows, :, :, :]
+        logs = log_weights[..., rows, :]
+        predicted, slope, extra = self._predict_components(mean, cov, group)
+        is_blind = np.isnan(predicted)
+        reason = "no component can see"
+        step.note_unseen(group, np.asarray(is_blind.all(axis=-2)), reason)
+        predicted_cov = slope @ cov @ slope.mT + extra
+        group = step.gate(
+            group,
+            _predicted_moments,
+            predicted,
+            np.exp(logs),
+            predicted_cov,
+            is_torn=True,
+            is_gaussian=False,
+        )
+        target = group.target[..., None, :]
+        innovation = target - predicted
+        # A component that cannot see what others can contradicts it.
+        is_seen = ~is_blind.all(axis=-2, keepdims=True) & ~np.isnan(target)
+        contradicts = (is_blind & is_seen).any(axis=-1)
+        noise = (group.noise[:, None] if group.noise.ndim == 3 else group.noise) + extra
+        prior = np.where(contradicts, _LEAST, logs)
+        new = step.apply(
+            _condition_bank,
+            (mean, cov, prior, innovation, slope, noise),
+            (mean, cov, logs, np.zeros(logs.shape[:-1])),
+            group.agents,
+        )
+        means[..., rows, :, :], covs[..., rows, :, :, :] = new[:2]
+        log_weights[..., rows, :] = new[2]
+        if step.scores:
+            step.add_log_likelihood(new[3], group.agents)
+
+    def _predict_components(
+        self, mean: Array, cov: Array, group: Received
+    ) -> tuple[Array, Array, Array]:
+        """Return predictions (*runs, G, L, M), slopes, and extra covariances of components."""
+        mean = np.ascontiguousarray(mean.swapaxes(-3, -2))
+        cov = np.ascontiguousarray(cov.swapaxes(-4, -3))
+        # The group's target for each component.
+        shape = (*mean.shape[:-1], group.target.shape[-1])
+        wide = group.with_target(np.broadcast_to(group.target[..., None, :, :], shape))
+        predicted, slope, extra = self._linearize(
+            partial(wide.predict, branch="first"),
+            wide.jacobian,
+            mean,
+            cov,
+            group.linear,
+        )
+        is_blind = np.asarray(np.isnan(slope).any(axis=-1))
+        predicted = np.where(is_blind, np.nan, predicted)
+        slope = np.where(is_blind[..., None], 0.0, slope)
+        if extra is None:
+            extra = np.zeros((*shape, shape[-1]))
+        return (
+            predicted.swapaxes(-3, -2),
+            slope.swapaxes(-4, -3),
+            extra.swapaxes(-4, -3),
+        )
+
+
+def _condition_bank(
+    mean: Array,
+    cov: Array,
+    logs: Array,
+    innovation: Array,
+    slope: Array,
+    noise: Array,
+    *_: Any,
+) -> tuple[Array, ...]:
+    """Condition components (..., L, d), and return normalised log-weights and log p(y) too."""
+    missing = np.asarray(np.isnan(innovation))
+    is_pair = ~missing[..., :, None] & ~missing[..., None, :]
+    # Missing numbers have a zero innovation and a unit covariance, of which no log p depends.
+    innovation_cov = slope @ cov @ slope.mT + noise
+    unit = np.eye(innovation.shape[-1])
+    lower = cholesky(np.where(is_pair, innovation_cov, unit))
+    squares = quadratic_form(lower, np.where(missing, 0.0, innovation))
+    count = (~missing).sum(axis=-1)
+    log_density = -0.5 * (squares + log_det(lower) + count * np.log(2 * np.pi))
+    joint = logs + log_density
+    total = log_sum_exp(joint)
+    new_mean, new_cov = condition(mean, cov, innovation, slope, noise)
+    return new_mean, new_cov, np.maximum(joint - total, _LEAST), total[..., 0]
+
+
+def _mix(weights: Array, means: Array, covs: Array) -> tuple[Array, Array]:
+    """Return moments of mixtures: Σ w m, and Σ w (P + (m - m̄)(m - m̄)ᵀ)."""
+    mean = (weights[..., None, :] @ means)[..., 0, :]
+    anomalies = means - mean[..., None, :]
+    spread = (weights[..., None, :] * anomalies.mT) @ anomalies
+    return mean, (weights[..., None, None] * covs).sum(axis=-3) + spread
+
+
+def _predicted_moments(
+    predicted: Array, weights: Array, covs: Array
+) -> tuple[Array, Array]:
+    """Return moments of the predictions of the components that can see; NaN if none can."""
+    sees = np.asarray(~np.isnan(predicted).any(axis=-1))
+    weights = np.where(sees, weights, 0.0)
+    total = weights.sum(axis=-1, keepdims=True)
+    weights = weights / np.where(total > 0, total, np.nan)
+    return _mix(weights, np.where(sees[..., None], predicted, 0.0), covs)

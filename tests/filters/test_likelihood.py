@@ -1,0 +1,199 @@
+"""Likelihood consensus: exact where the basis holds the likelihoods, close to it elsewhere."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.random import default_rng
+
+from distfilt.filters import (
+    LikelihoodConsensusFilter,
+    Observation,
+    ParticleFilter,
+    PolynomialBasis,
+)
+from distfilt.network import (
+    Faults,
+    average_consensus,
+    finite_time_consensus,
+    graphs,
+    naive_fusion,
+)
+from distfilt.sensors import Sensor, bearing, distance, increment
+from tests.filters.families import PRIOR, TIMES, data, model, still_model, team
+
+NET = graphs.path(5)
+QUADRATIC = PolynomialBasis([0, 1])
+
+
+def make(cls: Any, **options: Any) -> Any:
+    sensors = options.pop("sensors", team())
+    options = {"members": 400} | options
+    if cls is LikelihoodConsensusFilter:
+        options = {"basis": QUADRATIC, "fusion": finite_time_consensus} | options
+    else:
+        options = {"hops": "all"} | options
+    return cls(options.pop("model", model()), sensors, NET, **options)
+
+
+def last_of(f: Any, seen: Any, runs: tuple[int, ...] = ()) -> Any:
+    start = f.start(PRIOR, rng=default_rng(3), runs=runs)
+    *_, last = f.steps(start, TIMES, seen)
+    return last
+
+
+def test_quadratic_likelihoods_are_exact() -> None:
+    """With an exact average the same weights as those of a filter of all observations.
+
+    Both draw the same numbers, so that the particles are the same too.
+    """
+    sensors = team()
+    _, seen = data(sensors, (2,))
+    a = last_of(make(LikelihoodConsensusFilter), seen, (2,))
+    b = last_of(make(ParticleFilter), seen, (2,))
+    assert np.allclose(a.particles, b.particles, atol=1e-9)
+    assert np.allclose(a.weights, b.weights, atol=1e-9)
+    # Five monomials of degree one and two on each link and round.
+    assert (a.ledger.scalars == 5 * a.ledger.messages).all()
+
+
+def test_few_rounds_are_close_and_more_are_closer() -> None:
+    _, seen = data(team())
+    exact = make(ParticleFilter)
+    expected = exact.summarize(last_of(exact, seen)).mean
+    errors = []
+    for rounds in (1, 10, 80):
+        rule = partial(average_consensus, rounds=rounds)
+        f = make(LikelihoodConsensusFilter, fusion=rule, members=3000)
+        errors.append(np.abs(f.summarize(last_of(f, seen)).mean - expected).max())
+    assert errors[0] > 2 * errors[2]
+    assert errors[2] < 0.15
+
+
+def test_higher_degrees_follow_curved_sensors() -> None:
+    """Distances and bearings: each two degrees more divide the error by four or more."""
+    places = [[-3.0, 0.0], [0.0, -3.0], [3.0, 0.0], [0.0, 3.0]]
+    sensors: list[Any] = []
+    for k, place in enumerate(places):
+        kind = distance if k % 2 else bearing
+        sensors.append(kind([0, 1], std=0.4 if k % 2 else 0.2, origin=place))
+    sensors.append(None)
+    truth = np.array([0.9, 0.4])
+    seen = [None if s is None else s.predict(truth) for s in sensors]
+    prior = ([0.0, 0.0], 0.25 * np.eye(2))
+    options: dict[str, Any] = {"sensors": sensors, "model": still_model(2, 0.01)}
+    exact = make(ParticleFilter, members=2000, **options)
+    state = exact.step(exact.start(prior, rng=default_rng(0)), 1.0, seen)
+    expected = exact.summarize(state)
+    errors = []
+    for degree in (2, 4, 6):
+        f = make(
+            LikelihoodConsensusFilter,
+            members=2000,
+            basis=PolynomialBasis([0, 1], degree=degree, scale=3.0),
+            **options,
+        )
+        state = f.step(f.start(prior, rng=default_rng(0)), 1.0, seen)
+        errors.append(np.abs(f.summarize(state).mean - expected.mean).max())
+    assert errors[0] > 4 * errors[1] > 16 * errors[2]
+    assert errors[2] < 1e-3
+
+
+def test_the_centre_and_scale_of_the_basis_do_not_matter_to_a_fit() -> None:
+    """Polynomials of other coordinates are the same functions."""
+    _, seen = data(team())
+    far = PolynomialBasis(
+        [0, 1], centre=np.array([5.0, -3.0]), scale=np.array([2.0, 9.0])
+    )
+    a = last_of(make(LikelihoodConsensusFilter), seen)
+    b = last_of(make(LikelihoodConsensusFilter, basis=far), seen)
+    assert np.allclose(a.weights, b.weights, atol=1e-8)
+
+
+def test_a_basis_of_the_users_own() -> None:
+    """The only function that a sensor of |x| with unit noise needs beside x²."""
+
+    def basis(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.abs(x), x**2], axis=-1)
+
+    sensors = [Sensor(1, np.abs, [[1.0]])] * 5
+    f = make(
+        LikelihoodConsensusFilter,
+        sensors=sensors,
+        basis=basis,
+        model=still_model(1, 0.1),
+    )
+    g = make(ParticleFilter, sensors=sensors, model=still_model(1, 0.1))
+    prior = ([0.5], [[1.0]])
+    a = f.step(
+        f.start(prior, rng=default_rng(0)), 1.0, [[0.5 + 0.1 * k] for k in range(5)]
+    )
+    b = g.step(
+        g.start(prior, rng=default_rng(0)), 1.0, [[0.5 + 0.1 * k] for k in range(5)]
+    )
+    assert np.allclose(a.weights, b.weights, atol=1e-10)
+
+
+def test_particles_that_contradict_an_observation_have_little_weight() -> None:
+    """A likelihood of zero counts as the least of all others, and leaves the fit finite."""
+    root = Sensor(1, lambda x: np.where(x > 0, x, np.nan), [[0.5]])
+    sensors = [root] + [None] * 4
+    f = make(LikelihoodConsensusFilter, sensors=sensors, basis=PolynomialBasis([0]),
+             model=still_model(1, 0.1))  # fmt: skip
+    state = f.start(([0.5], [[1.0]]), rng=default_rng(0))
+    state = f.step(state, 1.0, [[1.0], None, None, None, None])
+    assert np.isfinite(state.log_weights).all()
+    assert np.allclose(state.weights.sum(axis=-1), 1.0)
+    # The mean moves towards what was seen, at all agents.
+    assert (f.summarize(state).mean > 0.7).all()
+
+
+def test_gate_losses_runs_and_failures() -> None:
+    _, seen = data(team(), (3,))
+    seen[0][2, 1] += 80.0
+    rule = partial(average_consensus, rounds=20)
+    f = make(
+        LikelihoodConsensusFilter, fusion=rule, gate_probability=0.9999,
+        faults=Faults(loss=0.1, seed=2),
+    )  # fmt: skip
+    state = f.start(PRIOR, rng=default_rng(3), runs=(3,))
+    rejected = 0.0
+    for k, t in enumerate(TIMES):
+        state = f.step(state, float(t), [None if y is None else y[k] for y in seen])
+        rejected += state.rejected
+    assert rejected[1, 0] >= 1
+    assert np.isfinite(f.summarize(state).mean).all()
+
+
+def test_without_links_agents_use_their_own() -> None:
+    _, seen = data(team())
+    f = LikelihoodConsensusFilter(
+        model(), team(), lambda t: np.zeros((5, 5)), basis=QUADRATIC,
+        fusion=finite_time_consensus, members=400,
+    )  # fmt: skip
+    g = make(ParticleFilter, hops=1, share_observations=False)
+    assert (last_of(f, seen).log_weights == last_of(g, seen).log_weights).all()
+
+
+def test_what_is_refused() -> None:
+    with pytest.raises(ValueError, match="^fusion must be a consensus rule"):
+        make(LikelihoodConsensusFilter, fusion=None)
+    with pytest.raises(ValueError, match="^fusion must be a rule that fuses vectors"):
+        make(LikelihoodConsensusFilter, fusion=naive_fusion)
+    with pytest.raises(ValueError, match="^sensors must not be increments here"):
+        make(LikelihoodConsensusFilter, sensors=[increment([0], std=1.0)] * 5)
+    seen = [[0.1], [0.1, 0.2], None, [0.1], [0.1, 0.2]]
+    f = make(LikelihoodConsensusFilter, members=5)
+    with pytest.raises(ValueError, match="^basis must have fewer functions than the 5"):
+        f.step(f.start(PRIOR, rng=default_rng(0)), 0.1, seen)
+    f = make(LikelihoodConsensusFilter, basis=lambda x: x[..., 0])
+    with pytest.raises(ValueError, match="^basis must have"):
+        f.step(f.start(PRIOR, rng=default_rng(0)), 0.1, seen)
+    f = make(LikelihoodConsensusFilter, lag=1)
+    state = f.step(f.start(PRIOR, rng=default_rng(0)), 0.1, seen)
+    state = f.step(state, 0.2, seen)
+    with pytest.raises(ValueError, match="^delayed must be empty here"):
+        f.step(state, 0.3, seen, delayed=[Observation(0.2, 0, [0.3])])
