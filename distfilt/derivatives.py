@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
@@ -33,6 +33,16 @@ _NEGLIGIBLE = 1e-7
 _VISIBLE = 1e-3
 # A step's rounding error is at most so many units of the values' precision, over the step.
 _MARGIN = 4.0
+
+
+class HasDerivative(Protocol):
+    """A model or a sensor: an object whose derivative may be given."""
+
+    @property
+    def derivative(self) -> Callable[..., Array] | None: ...
+
+    @property
+    def is_validated(self) -> bool: ...
 
 
 @dataclass(eq=False)
@@ -348,8 +358,8 @@ def _noise_of_two_steps(short: _Differences, long: _Differences, x: Array) -> Ar
 
 
 def evaluate_derivative(
-    owner: Any,
-    args: tuple[Any, ...],
+    owner: HasDerivative,
+    args: tuple[Array | float, ...],
     shape: tuple[int, ...],
     differences: Callable[..., tuple[Array, Array]],
     static: Array | float = 0.0,
@@ -408,7 +418,7 @@ def evaluate_derivative(
     return slope if slope.shape == shape else np.broadcast_to(slope, shape)
 
 
-def needs_differences(owner: Any) -> bool:
+def needs_differences(owner: HasDerivative) -> bool:
     """Whether differences are taken for an owner's derivative: in its place, or to check it."""
     if owner.derivative is None:
         return True

@@ -40,25 +40,21 @@ class Team:
 
     def state(self, egos: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return transition, noise and prior covariance of [target; egos]."""
-        (n, e) = self.dims
-        identity = np.eye(egos)
-        blocks = (
-            (self.move, np.kron(identity, np.eye(e))),
-            (self.noise, np.kron(identity, np.zeros((e, e)))),
+        _, e = self.dims
+        # Agents stand still: identity transition, no noise
+        egos_move = np.eye(egos * e)
+        egos_noise = np.zeros((egos * e, egos * e))
+        egos_cov = np.kron(np.eye(egos), self.ego_cov)
+        return (
+            join_blocks(self.move, egos_move),
+            join_blocks(self.noise, egos_noise),
+            join_blocks(self.target_cov, egos_cov),
         )
-        full = [np.zeros((n + egos * e, n + egos * e)) for _ in range(3)]
-        for matrix, (a, b) in zip(
-            full,
-            (*blocks, (self.target_cov, np.kron(identity, self.ego_cov))),
-            strict=True,
-        ):
-            matrix[:n, :n] = a
-            matrix[n:, n:] = b
-        return full[0], full[1], full[2]
 
     def sees(self, agent: int, egos: int) -> np.ndarray:
         """Return the matrix H of an agent's observation of [target; egos]."""
         n, e = self.dims
+        # y = [I 0] t - e_a: the target's first components, minus the agent's position
         h = np.zeros((e, n + egos * e))
         h[:, :e] = np.eye(e)
         h[:, n + agent * e : n + (agent + 1) * e] = -np.eye(e)
@@ -71,31 +67,33 @@ class Team:
 
     def data(self, steps: int, runs: int, rng: np.random.Generator) -> tuple:
         """Draw targets (steps, runs, n) and observations (steps, runs, A, e)."""
-        (n, e) = self.dims
-        (move, noise, first) = self.state(self.size)
-        x = rng.multivariate_normal(np.zeros(len(first)), first, size=runs)
+        n, e = self.dims
+        move, noise, first = self.state(self.size)
+        zero = np.zeros(len(first))
+        # The true state of a run is a draw from the prior.
+        x = rng.multivariate_normal(zero, first, size=runs)
         h = np.array([self.sees(a, self.size) for a in range(self.size)])
         truth = []
         seen = []
         for _ in range(steps):
-            x = x @ move.T + rng.multivariate_normal(
-                np.zeros(len(x.T)), noise, size=runs
-            )
+            process_noise = rng.multivariate_normal(zero, noise, size=runs)
+            x = x @ move.T + process_noise
             errors = rng.multivariate_normal(
                 np.zeros(e), self.observation_cov, size=(runs, self.size)
             )
+            # Each agent has a row of H of its own; the batch is over runs.
+            exact = (h @ x[:, None, :, None])[..., 0]
             truth.append(x[:, :n])
-            seen.append((h @ x[:, None, :, None])[..., 0] + errors)
+            seen.append(exact + errors)
         return np.array(truth), np.array(seen)
 
     def arrivals(self, k: int, runs: int) -> np.ndarray:
         """Return whether a message of step k from j reaches i, (runs, i, j)."""
         received = np.zeros((runs, self.size, self.size), dtype=bool)
-        lost = (
-            False
-            if self.faults is None
-            else self.faults.draw_losses(self.graph, k, runs)
-        )
+        # One draw for each link of the graph, in its order
+        lost = np.zeros((runs, len(self.graph.senders)), dtype=bool)
+        if self.faults is not None:
+            lost = self.faults.draw_losses(self.graph, k, runs)
         received[:, self.graph.receivers, self.graph.senders] = ~np.asarray(lost)
         return received
 
@@ -103,8 +101,9 @@ class Team:
         """Return beliefs about the target after each step, (steps, runs, A, n) and covariances."""
         if way == "joint":
             return self._joint(seen)
-        (n, _) = self.dims
-        (move, noise, first) = self.state(1)
+        n, _ = self.dims
+        # The state [target; ego] of one agent, the same for all
+        move, noise, first = self.state(1)
         steps, runs = seen.shape[:2]
         mean = np.zeros((runs, self.size, len(first)))
         cov = np.broadcast_to(first, (runs, self.size, *first.shape))
@@ -132,6 +131,7 @@ class Team:
         model = LinearModel.from_transition(
             len(move), lambda dt: move, lambda t, dt: noise
         )
+        # One linear sensor for each agent
         eyes = []
         for agent in range(self.size):
             h = self.sees(agent, self.size)
@@ -149,7 +149,8 @@ class Team:
 
     def _joint(self, seen: np.ndarray) -> Belief:
         f = self.joint()
-        (n, _) = self.dims
+        n, _ = self.dims
+        # All agents start with the prior of the whole state.
         first = self.state(self.size)[2]
         state = f.start((np.zeros(len(first)), first), runs=seen.shape[1:2])
         beliefs = []
@@ -157,6 +158,15 @@ class Team:
             state = f.step(state, k + 1.0, list(np.moveaxis(y, 1, 0)))
             beliefs.append((state.means[..., :n], state.covariances[..., :n, :n]))
         return np.array([m for m, _ in beliefs]), np.array([p for _, p in beliefs])
+
+
+def join_blocks(target: np.ndarray, egos: np.ndarray) -> np.ndarray:
+    """Return the block diagonal of a matrix of the target and one of the egos."""
+    n = len(target)
+    full = np.zeros((n + len(egos), n + len(egos)))
+    full[:n, :n] = target
+    full[n:, n:] = egos
+    return full
 
 
 def condition(
@@ -168,6 +178,7 @@ def condition(
     gate: float | None = None,
 ) -> Belief:
     """Return Gaussians after observations y of h; one outside the gate is ignored."""
+    # Innovation y - H m, and its covariance S = H P Hᵀ + R
     gap = (y - mean @ h.T)[..., None]
     spread = h @ cov @ h.T + r
     # K = P Hᵀ S⁻¹, by a solve
@@ -181,6 +192,7 @@ def condition(
 
 def information(mean: np.ndarray, cov: np.ndarray, n: int) -> Belief:
     """Return information vector and matrix of the first n components."""
+    # J = P⁻¹ and η = J m
     matrix = np.linalg.inv(cov[..., :n, :n])
     return (matrix @ mean[..., :n, None])[..., 0], matrix
 
@@ -192,6 +204,7 @@ def add_information(
     mean, cov = belief
     # G = P[:, :n] (I + J P_nn)⁻¹
     gain = cov[..., :n] @ np.linalg.inv(np.eye(n) + matrix @ cov[..., :n, :n])
+    # m + G (η - J m) and P - G J P
     gap = vector - (matrix @ mean[..., :n, None])[..., 0]
     return mean + (gain @ gap[..., None])[..., 0], cov - gain @ matrix @ cov[..., :n, :]
 
@@ -200,10 +213,13 @@ def exchange_increments(
     before: Belief, after: Belief, arrived: np.ndarray, n: int
 ) -> Belief:
     """Add the information increments of the agents whose messages arrive."""
-    (v0, j0), (v1, j1) = (information(*belief, n) for belief in (before, after))
+    vector_before, matrix_before = information(*before, n)
+    vector_after, matrix_after = information(*after, n)
+    # Agent i adds the increments of all j whose messages arrive.
     w = arrived.astype(np.float64)
-    vector = np.einsum("rij,rjn->rin", w, v1 - v0)
-    return add_information(after, vector, np.einsum("rij,rjmn->rimn", w, j1 - j0), n)
+    vector = np.einsum("rij,rjn->rin", w, vector_after - vector_before)
+    matrix = np.einsum("rij,rjmn->rimn", w, matrix_after - matrix_before)
+    return add_information(after, vector, matrix, n)
 
 
 def intersect_beliefs(
@@ -214,14 +230,19 @@ def intersect_beliefs(
     # Row i has equal weights of the beliefs that agent i has.
     w = arrived + np.eye(arrived.shape[-1])
     w = w / w.sum(axis=-1, keepdims=True)
-    fused = np.einsum("rij,rjn->rin", w, vector), np.einsum("rij,rjmn->rimn", w, matrix)
-    return add_information(after, fused[0] - vector, fused[1] - matrix, n)
+    # Covariance intersection averages the information about the target.
+    fused_vector = np.einsum("rij,rjn->rin", w, vector)
+    fused_matrix = np.einsum("rij,rjmn->rimn", w, matrix)
+    # The ego follows through its correlation with the target.
+    return add_information(after, fused_vector - vector, fused_matrix - matrix, n)
 
 
 def nees(truth: np.ndarray, belief: Belief) -> np.ndarray:
     """NEES per component of the target, (steps, runs, A)."""
     gap = (belief[0] - truth[:, :, None])[..., None]
-    return (gap.mT @ np.linalg.solve(belief[1], gap))[..., 0, 0] / gap.shape[-2]
+    # eᵀ P⁻¹ e over the number of components
+    squares = (gap.mT @ np.linalg.solve(belief[1], gap))[..., 0, 0]
+    return squares / gap.shape[-2]
 
 
 def nees_quantile(share: float, n: int) -> float:

@@ -23,8 +23,11 @@ from distfilt.updates import principal_components, principal_directions, update
 
 NAME = "figure-1-inputs"
 PAPER = "grange"
-BATCH = 5
 SETUP = satellites.setup("table-2")
+# Ten batches of figure_1.py in one, since many runs cost little more than a few; one
+# for the short trials of a scenario that a reader has changed.
+PARTS = 1 if SETUP.is_changed else 10
+BATCH = 5 * PARTS
 VERSIONS = {"bare": False, "pca": True}
 MEMBERS = (8, 9, 11, 20, 30)
 GAINS = {"g00": 0.0, "g01": 0.01, "g10": 0.1, "g30": 0.3}
@@ -32,8 +35,13 @@ WRAPS = ("together", "never", "innovation")
 # Noise of standard deviation σ in each step: Q = σ² I is the Q of σ / sqrt(Δ) per √s.
 STEP_NOISE = float(0.2 / np.sqrt(SETUP.scenario["dt_observe"]))
 NOISY = satellites.setup("table-2", process_noise=STEP_NOISE)
-# The angle's place among the numbers that B (three) and A (six) receive; C gets none.
-ANGLE_OF_SIZE = {3: 2, 6: 2}
+# Which of an agent's numbers are angles, by how many it receives: C receives none.
+ANGLE_OF_SIZE = {}
+for links in SETUP.scenario.adjacency + np.eye(len(SETUP.sensors)):
+    received = [q for q, link in zip(SETUP.sensors, links, strict=True) if link]
+    is_angle = np.concatenate([[q.wraps] * q.dim for q in received])
+    if is_angle.any():
+        ANGLE_OF_SIZE[is_angle.size] = np.flatnonzero(is_angle)
 # Few members have no NEES, as their covariance is singular; nor has line 8 as printed.
 UNSCORED = [f"m{n:02d}_{v}" for n in MEMBERS for v in VERSIONS]
 UNSCORED += [f"m{n:02d}_together_{v}" for n in (8, 13) for v in VERSIONS]
@@ -49,7 +57,7 @@ parameters = {
     "gains": list(GAINS.values()),
     "step_noise": STEP_NOISE,
 }
-seeds = np.random.SeedSequence(satellites.SEED).spawn(SETUP.runs // BATCH)
+seeds = np.random.SeedSequence([satellites.SEED, 1]).spawn(SETUP.runs // BATCH)
 scenarios = (SETUP.scenario,)
 rtol = 1e-3
 # A run that diverges does so from its last bit on.
@@ -144,30 +152,52 @@ def run_case(
     return satellites.score_runs(s, name, result, each_agent=False)
 
 
+def draw_batches(
+    s: satellites.Setup, seed: np.random.SeedSequence
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The truths and observations of ten batches of `figure_1.py`, side by side."""
+    # The seed's number says which ten.
+    first = PARTS * seed.spawn_key[-1]
+    of_figure = np.random.SeedSequence(satellites.SEED).spawn(PARTS + first)[first:]
+    truths = []
+    observations = []
+    for batch in of_figure:
+        # As in the trial of figure_1.py
+        for_data, _ = batch.spawn(2)
+        rng = np.random.default_rng(for_data)
+        truth, seen = satellites.draw_data(s, rng, (BATCH // PARTS,))
+        truths.append(truth)
+        observations.append(seen)
+    # Runs are the second axis.
+    by_sensor = zip(*observations, strict=True)
+    return (
+        np.concatenate(truths, axis=1),
+        [np.concatenate(batches, axis=1) for batches in by_sensor],
+    )
+
+
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """A batch of runs of every case on the same data; σ of a step has data of its own."""
-    for_data, for_filters = seed.spawn(2)
-    data = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    data = draw_batches(SETUP, seed)
     values: dict[str, float] = {}
     for name, f in filters():
-        values |= run_case(SETUP, name, f, for_filters, data)
+        values |= run_case(SETUP, name, f, seed, data)
     # The truth has the larger noise as well as the members.
-    data = satellites.draw_data(NOISY, np.random.default_rng(for_data), (BATCH,))
+    data = draw_batches(NOISY, seed)
     for v, pca in VERSIONS.items():
         f = satellites.paper_filter(NOISY, pca=pca)
-        values |= run_case(NOISY, f"step_{v}", f, for_filters, data)
+        values |= run_case(NOISY, f"step_{v}", f, seed, data)
     return values
 
 
 def part(seed: np.random.SeedSequence) -> dict[str, float]:
     """The filter with angles on one branch, as in the trial, for chapter 4 to run again."""
-    for_data, for_filters = seed.spawn(2)
-    data = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
     f = filter_with_wrap(WRAPS[0], pca=False)
-    return run_case(SETUP, f"{WRAPS[0]}_bare", f, for_filters, data)
+    return run_case(SETUP, f"{WRAPS[0]}_bare", f, seed, draw_batches(SETUP, seed))
 
 
 code = (
+    draw_batches,
     satellites.draw_data,
     satellites.paper_filter,
     satellites.align_each,

@@ -267,6 +267,9 @@ code = (
     team.Team,
     team.condition,
     team.nees,
+    team.join_blocks,
+    team.information,
+    team.add_information,
     team.exchange_increments,
     team.intersect_beliefs,
 )

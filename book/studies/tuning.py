@@ -31,12 +31,9 @@ VERSIONS = {
     for pca in (False, True)
     for own in (True, False)
 }
-# Table II measures an angle: it is tuned once more with predictions on one branch.
-TREATMENTS = {"II": ("II", "each"), "III": ("III", "each")}
-TREATMENTS |= {"II_together": ("II", "together")}
 columns = [
-    f"{treatment}_{v}_g{k}_{quantity}"
-    for treatment in TREATMENTS
+    f"{t}_{v}_g{k}_{quantity}"
+    for t in SETUPS
     for v in VERSIONS
     for k in range(len(GAINS))
     for quantity in ("mse", "nees")
@@ -63,30 +60,27 @@ def every_gain(
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One run of each table, all versions on the same data."""
     metrics: dict[str, float] = {}
-    # A table's data, and the seed of its filters
-    data: dict[str, Any] = {}
     for (table, s), part in zip(SETUPS.items(), seed.spawn(2), strict=True):
+        # Both tables have data and draws of their own.
         for_data, for_filters = part.spawn(2)
         truth, seen = satellites.draw_data(s, np.random.default_rng(for_data), ())
         shape = (truth.shape[0], len(GAINS), truth.shape[-1])
+        # One run of the data, as often as there are gains
         truth = np.broadcast_to(truth[:, None], shape)
-        data[table] = truth, seen, for_filters
-    for treatment, (table, angles) in TREATMENTS.items():
-        s = SETUPS[table]
-        truth, seen, for_filters = data[table]
         for name, (pca, include_self) in VERSIONS.items():
-            f = satellites.paper_filter(s, pca=pca, angles=angles)
+            f = satellites.paper_filter(s, pca=pca)
             # One gain for each of the runs, in place of the scenario's.
-            f = f.replace(fusion=partial(every_gain, include_self=include_self))
-            result = satellites.run_filter(s, f, for_filters, truth, seen)
+            rule = partial(every_gain, include_self=include_self)
+            f = f.replace(fusion=rule)
+            late = satellites.run_filter(s, f, for_filters, truth, seen).isel(
+                time=s.settled
+            )
             # Settled means over the agents, NEES per component
-            late = result.isel(time=s.settled)
             error = late["total_squared_error"].mean(("time", "agent")).values
             nees = late["nees"].mean(("time", "agent")).values / s.model.dim
             for k in range(len(GAINS)):
-                prefix = f"{treatment}_{name}_g{k}"
-                metrics[f"{prefix}_mse"] = float(error[k])
-                metrics[f"{prefix}_nees"] = float(nees[k])
+                metrics[f"{table}_{name}_g{k}_mse"] = float(error[k])
+                metrics[f"{table}_{name}_g{k}_nees"] = float(nees[k])
     return metrics
 
 

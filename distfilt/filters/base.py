@@ -9,7 +9,13 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import (
+    Callable,
+    Collection,
+    Iterable,
+    Iterator,
+    Sequence,
+)
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import (
@@ -117,7 +123,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
                 f"names must have {n} different names, got {list(self.names)}"
             )
         # A rule of the library says which kind of belief it fuses; others are not asked.
-        kind = None if self.fusion is None else kind_of_rule(self.fusion)
+        kind = kind_of_rule(self.fusion) if callable(self.fusion) else None
         if kind is not None and kind != self.belief_kind:
             raise ValueError(
                 f"fusion must be a rule that fuses {self.belief_kind}, got one of {kind}"
@@ -136,7 +142,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
     # The behaviour of a family without the option. A class of `options` makes a field of it.
 
     @cached_property
-    def fusion(self) -> Any:
+    def fusion(self) -> object:
         """The fusion rule; none by default."""
         return None
 
@@ -201,6 +207,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
     def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Names and units of the state's components."""
 
+    # Any: the form of the observations is the family's own.
     @abstractmethod
     def read_observations(
         self, observations: object, runs: tuple[int, ...], t: float
@@ -210,7 +217,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
     @abstractmethod
     def initial_state(
         self, prior: Prior, runs: tuple[int, ...], rng: np.random.Generator | None
-    ) -> dict[str, Any]:
+    ) -> dict[str, object]:
         """Return the family's own fields of the first state."""
 
     @abstractmethod
@@ -260,10 +267,8 @@ class Filter(FrozenModel, ABC, Generic[S]):
         t : float
             The time of the prior, in s.
         """
-        if self.requires_rng and rng is None:
-            raise InvalidArgumentError(
-                "rng must be a numpy.random.Generator, got None: use np.random.default_rng(seed)"
-            )
+        if self.requires_rng:
+            require_rng(rng)
         if runs and not self.supports_runs:
             raise ValueError(
                 f"runs must be () for a filter of one run at a time, got {runs!r}"
@@ -276,7 +281,9 @@ class Filter(FrozenModel, ABC, Generic[S]):
         if self.requires_rng and rng is not None:
             (child,) = rng.spawn(1)
         ledger = Ledger.empty(self.n_agents)
-        return cast(S, self.state_class(t, ledger, child, **fields))
+        # The class is the family's own, whose fields these are.
+        make = cast(Callable[..., S], self.state_class)
+        return make(t, ledger, child, **fields)
 
     @validated
     def step(
@@ -332,26 +339,27 @@ class Filter(FrozenModel, ABC, Generic[S]):
         # `failed` of a SensorState has one entry for each run.
         runs = state.failed.shape if isinstance(state, SensorState) else state.runs
         read = self.read_observations(observations, runs, t)
+        sensor_filter = self if isinstance(self, SensorFilter) else None
         matched: Sequence[Observation] = ()
         if delayed:
             moved = insert_times(self, delayed, state, t, reuse_rng=reuse_rng)
             # The generator of a state that was made here is not the user's.
             reuse_rng = reuse_rng or moved is not state
             state = moved
-            matched = match_delayed(cast(Any, self), delayed, state, t)
+            if sensor_filter is not None:
+                matched = match_delayed(sensor_filter, delayed, state, t)
         repeated: list[Observation] = []
-        has_sensors = hasattr(self, "agent_sensors")
         # Mostly each agent has one observation, of a new time: then none has come before.
         is_plain = not matched and t > state.t
-        if has_sensors and (not is_plain or max(map(len, read)) > 1):
+        if sensor_filter is not None and (not is_plain or max(map(len, read)) > 1):
             read, matched, repeated = drop_repeated(
-                read, matched, state.assimilated, cast(Any, self).model.dim
+                read, matched, state.assimilated, sensor_filter.model.dim
             )
         # From here on all inputs are checked, and the family's own method does the rest.
         step = Step(self, state, t, read, matched, reuse_rng=reuse_rng)
         if repeated:
             step.warn_once("repeated", _describe_repetition(repeated[0]))
-        if has_sensors and (is_single or matched):
+        if sensor_filter is not None and (is_single or matched):
             unplanned = [*read, matched] if is_single else [matched]
             # Angles below four turns need no closer look.
             large = [o for part in unplanned for o in part if (abs(o.value) > 25).any()]
@@ -780,6 +788,15 @@ class SensorFilter(Filter[S]):
         return result
 
 
+def require_rng(rng: Rng | None) -> Rng:
+    """Return a generator, or refuse to do without one."""
+    if rng is None:
+        raise InvalidArgumentError(
+            "rng must be a numpy.random.Generator, got None: use np.random.default_rng(seed)"
+        )
+    return rng
+
+
 def _describe_repetition(observation: Observation) -> str:
     """Return the warning of an observation that has come twice."""
     sensor = observation.sensor
@@ -795,13 +812,13 @@ def _arrival_time(observation: Observation) -> float:
     return -np.inf if observation.arrival_time is None else observation.arrival_time
 
 
-def _smooth_states(states: Iterable[Any], lag: int) -> Iterator[tuple[Any, Any]]:
+def _smooth_states(states: Iterable[S], lag: int) -> Iterator[tuple[S, S]]:
     """Yield each state, and the belief about its time when `lag` more have been observed."""
     if not lag:
         for state in states:
             yield state, state
         return
-    recent: list[SensorState] = []
+    recent: list[S] = []
     for state in states:
         recent.append(state)
         steps = [one.t for one in recent]

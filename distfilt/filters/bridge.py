@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from .observations import Observation
 
 if TYPE_CHECKING:
     from .base import Filter
+    from .ensemble import MembersFilter, MemberState
     from .gaussian import GaussianFilter, GaussianState
     from .states import AnyState, State
 
@@ -201,13 +202,17 @@ def insert_gaussian(
     )
 
 
-def insert_members(f: Any, state: Any, t_obs: float) -> Any:
+def insert_members(
+    f: MembersFilter[MemberState], state: MemberState, t_obs: float
+) -> MemberState:
     """Return a state of members with those of a time between two that it keeps."""
+    from .base import require_rng
     from .step import copy_rng
 
     place, start, end = split_history(state, t_obs)
-    beliefs = [*[belief for _, belief in state.history], state.belief]
-    rng = copy_rng(state.rng)
+    beliefs = [*[belief for _, belief in state.past], state.belief]
+    # Steps of members draw, so that their states have a generator.
+    rng = copy_rng(require_rng(state.rng))
     drawn = draw_bridge(
         f.model,
         beliefs[place - 1],
@@ -216,6 +221,6 @@ def insert_members(f: Any, state: Any, t_obs: float) -> Any:
         f.draw_normal(state.belief.shape, rng),
         f.periods,
     )
-    history = list(state.history)
+    history = list(state.past)
     history.insert(place, (t_obs, drawn))
     return state.replace(history=tuple(history[-f.lag :]), rng=rng)

@@ -9,7 +9,7 @@ lag is.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,9 @@ __all__ = ["Previous", "References", "Source"]
 
 Source = tuple[int, int]
 """An agent, and the number of its sensor."""
+
+Times = float | Array
+"""One time for all runs and components, or one for each, (*runs, m)."""
 
 
 class Previous(NamedTuple):
@@ -72,7 +75,7 @@ class References:
     ) -> None:
         self.t = t
         # Before its first observation a sensor compares with the start.
-        self.last: dict[Source, Any] = dict.fromkeys(sources, state.t)
+        self.last: dict[Source, Times] = dict.fromkeys(sources, state.t)
         for agent, number, times in state.last_changes:
             self.last[agent, number] = times
         self.after = self.last.copy()
@@ -115,7 +118,7 @@ class References:
         group: Received,
         past: Sequence[Array],
         times: Sequence[float],
-        origin: Any,
+        origin: tuple[float, Array] | None,
     ) -> list[Previous]:
         """Return the earlier members with which a group's present observations are compared.
 
@@ -158,12 +161,12 @@ class References:
         return np.concatenate(parts, axis=-1)
 
     @property
-    def last_changes(self) -> tuple[tuple[int, int, Any], ...]:
+    def last_changes(self) -> tuple[tuple[int, int, Times], ...]:
         """The times after the step, as a state keeps them."""
         return tuple([(*source, times) for source, times in self.after.items()])
 
 
-def _list_times(values: Iterable[Any]) -> set[float]:
+def _list_times(values: Iterable[Times]) -> set[float]:
     """Return the different numbers in arrays and numbers, without NaN."""
     times: set[float] = set()
     for value in values:

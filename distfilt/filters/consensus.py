@@ -41,8 +41,8 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
 
     and the same for the vectors. As an average times A is a sum, all of them with ω = A are the
     Kalman filter of all observations if the averages are exact, whatever model and noise. They
-    differ after few rounds: "measurements" leaves forecasts apart, so that an agent may not learn
-    what its own observations do not show; "hybrid" with ω = 1 never counts information twice
+    differ after few rounds: "measurements" leaves forecasts apart, so that an agent may learn little
+    of components that its own sensors do not observe; "hybrid" with ω = 1 never counts information twice
     (consensus on information); "weighted" is "hybrid" with ω = A for half of the numbers.
 
     Parameters
@@ -113,10 +113,12 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
         gained = np.zeros((*branch.shape, branch.shape[-1] + 1))
         for _, group in step.received():
             self._add_information(gained, means, branch, covs, group, step)
+        # δΩ and δq of each agent's own observations
         own = pack_information(gained[..., :-1], gained[..., -1])
         if not step.has_fusion:
             new = self._add(step, branch, covs, own)
         elif self.average == "measurements":
+            # Ω + ω ⟨δΩ⟩
             (averaged,) = step.fuse(own)
             new = self._add(step, branch, covs, self._omega * averaged)
         else:
@@ -126,6 +128,7 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
 
     @property
     def _omega(self) -> float:
+        """The weight ω of averaged information; the average times A is the sum."""
         return float(self.n_agents) if self.weight is None else self.weight
 
     def _total(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ from ..validation import (
     call_user,
     check_array,
     format_number,
+    Rng,
 )
 from .observations import list_by_agent
 from .options import ExchangesAtIntervals
@@ -184,7 +185,7 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
     floor: PositiveFloat | None = None
     process: PositiveFloat | None = None
 
-    state_class: ClassVar[type[Any]] = DensityState
+    state_class: ClassVar[type[State]] = DensityState
     supports_runs: ClassVar[bool] = False
     belief_kind: ClassVar[str | None] = "densities"
 
@@ -212,18 +213,18 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
         return np.array(range(self.n_agents) if self.local is None else self.local)
 
     def read_observations(
-        self, observations: Any, runs: tuple[int, ...], t: float
+        self, observations: object, runs: tuple[int, ...], t: float
     ) -> SwarmSnapshot:
         """Check the agents' positions (A, d); None and NaN are agents that have gone."""
         # An agent that has gone has no position.
         missing = np.full(self.model.grid.dim, np.nan)
         entries = list_by_agent(observations, self.n_agents)
-        positions: Any = [missing if entry is None else entry for entry in entries]
+        positions = [missing if entry is None else entry for entry in entries]
         return self._snapshot(positions, "observations", t)
 
     def initial_state(
-        self, prior: Prior, runs: tuple[int, ...], rng: Any
-    ) -> dict[str, Any]:
+        self, prior: Prior, runs: tuple[int, ...], rng: Rng | None
+    ) -> dict[str, object]:
         """Return the estimates at the agents' first positions (A, d), NaN for absent agents."""
         snapshot = self._snapshot(prior, "prior", 0.0)
         agents = self.filtering
@@ -259,7 +260,7 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
             return np.where(snapshot.present[:, None], kernels, flat)
         return flat
 
-    def _snapshot(self, positions: Any, name: str, t: float) -> SwarmSnapshot:
+    def _snapshot(self, positions: object, name: str, t: float) -> SwarmSnapshot:
         """Check positions (A, d) and return them with their kernels."""
         shape = (self.n_agents, self.model.grid.dim)
         x = check_array(positions, name, shape, finite=False)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property, partial
 from inspect import signature
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
+from typing import Annotated, ClassVar, Literal, TypeVar, cast
 
 import numpy as np
 
@@ -45,7 +45,7 @@ from ..validation import (
     check_array,
     format_number,
 )
-from .base import SensorFilter
+from .base import SensorFilter, require_rng
 from .bridge import insert_members
 from .options import (
     ExchangesAtIntervals,
@@ -127,20 +127,22 @@ class MembersFilter(
 
     def reset_belief(self, state: MemberState, reset: Reset) -> MemberState:
         """Return the state with new draws of some components."""
-        rng = copy_rng(cast(Rng, state.rng))
-        new = reset_members(state, reset, self.draw_normal, rng)
-        return cast(MemberState, new)
+        rng = copy_rng(require_rng(state.rng))
+        return reset_members(state, reset, self.draw_normal, rng)
 
     def insert_time(self, state: MemberState, t: float) -> MemberState:
         """Return the state with draws of a time between two that it keeps, given both."""
-        return cast(MemberState, insert_members(self, state, t))
+        return insert_members(self, state, t)
 
     def draw_normal(self, shape: tuple[int, ...], rng: Rng) -> Array:
         """Draw standard normal numbers for members (*runs, A, N, d)."""
         return rng.standard_normal(shape)
 
-    def draw_prior(self, prior: Prior, leading: tuple[int, ...], rng: Rng) -> Array:
+    def draw_prior(
+        self, prior: Prior, leading: tuple[int, ...], rng: Rng | None
+    ) -> Array:
         """Draw members (*leading, N, d) of a prior, or of each agent's."""
+        rng = require_rng(rng)
         dim = self.model.dim
         priors = split_by_agent(prior, dim, self.n_agents)
         if priors is not None:
@@ -236,7 +238,7 @@ class EnsembleFilter(
         model: Model,
         sensors: Sequence[Sensor | None],
         graph: Graph | Callable[[float], Graph] | None = None,
-        **options: Any,
+        **options: object,
     ) -> EnsembleFilter:
         """Second-order exact draws, and covariance intersection of least determinant.
 
@@ -265,10 +267,12 @@ class EnsembleFilter(
         True
         """
         # The user's options come last and win.
-        exact: dict[str, Any] = {"update": enkf_exact, "forecast": exact_forecast}
+        exact: dict[str, object] = {"update": enkf_exact, "forecast": exact_forecast}
         if graph is not None:
             exact["fusion"] = partial(intersect_ensembles, rule="min_determinant")
-        return cls(model, sensors, graph, **(exact | options))
+        # The constructor checks the options.
+        make = cast(Callable[..., EnsembleFilter], cls)
+        return make(model, sensors, graph, **(exact | options))
 
     @cached_property
     def _repredicts(self) -> bool:
@@ -291,7 +295,7 @@ class EnsembleFilter(
         return has_tag(self.update, "locates")
 
     def initial_state(
-        self, prior: Prior, runs: tuple[int, ...], rng: Any
+        self, prior: Prior, runs: tuple[int, ...], rng: Rng | None
     ) -> dict[str, object]:
         """Draw members for each agent."""
         members = self.draw_prior(prior, (*runs, self.n_agents), rng)
@@ -357,7 +361,11 @@ class EnsembleFilter(
             predict = partial(group.predict, previous=previous, branch=branch)
         located = self._locate_observations(group) if self._locates else ()
 
-        def compute(h: Array, y: Array, *args: Any) -> tuple[Array, ...]:
+        def compute(
+            h: Array,
+            y: Array,
+            *args: *tuple[*tuple[Array, ...], Array, Rng],
+        ) -> tuple[Array, ...]:
             *arrays, noise, rng = args
             # The places of the observations come behind the members of all times.
             places = arrays.pop() if located else None
@@ -417,7 +425,7 @@ class EnsembleFilter(
         y: Array,
         noise: Array,
         rng: Rng,
-        predict: Any,
+        predict: Callable[[Array], Array] | None,
         places: Array | None = None,
     ) -> Array:
         """Update ensembles (..., G, N, d); a plain function gets one agent's at a time."""
@@ -511,7 +519,7 @@ class TransportFilter(_EnsembleSummary):
     supports_likelihoods: ClassVar[bool] = True
 
     def initial_state(
-        self, prior: Prior, runs: tuple[int, ...], rng: Any
+        self, prior: Prior, runs: tuple[int, ...], rng: Rng | None
     ) -> dict[str, object]:
         """Draw one set of members, (N, d) or (*runs, 1, N, d), for all agents."""
         if split_by_agent(prior, self.model.dim, self.n_agents) is not None:

@@ -7,15 +7,18 @@ each of them has. :func:`fuse_beliefs` applies the filter's fusion rule after th
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from ..network import Channel
+from ..network.channel import Payload
 from ..sensors import Sensor
-from ..validation import Array, call_user, check_array, format_number
+from ..validation import Array, Indices, call_user, check_array, format_number
 from .flooding import flood_observations
 from .observations import Observation, sensor_of
+from .states import SensorState
 
 if TYPE_CHECKING:
     from .changes import References
@@ -38,14 +41,15 @@ def collect_observations(step: Step[AnyState]) -> Known:
     for observation in step.delayed:
         observed[observation.agent].append(observation)
     sent = _choose_outgoing(step, observed)
-    inbox: list[dict[int, Any]] = [{} for _ in observed]
+    inbox: Sequence[Mapping[int, Payload]] = [{} for _ in observed]
     if sent and step.filter.hops != 1:
         inbox = _flood(step, sent)
     elif sent:
         inbox = step.channel.broadcast(_pack(step, sent))
     own_labels = _label(step, observed)
     # Receivers know their neighbours' sensors, so only values travel.
-    sent_labels = _label(step, sent) if step.state.pending else own_labels
+    has_waited = bool(cast(SensorState, step.state).pending)
+    sent_labels = _label(step, sent) if has_waited else own_labels
     by_time: Known = {}
     for agent, messages in enumerate(inbox):
         # In order of the senders, so that all agents with the same set have the same order.
@@ -58,7 +62,7 @@ def collect_observations(step: Step[AnyState]) -> Known:
                 times_and_sensors = sent_labels[sender]
                 listed = sent[sender]
                 payload = messages[sender]
-                values = list(payload) if type(payload) is tuple else [payload]
+                values = list(payload) if isinstance(payload, tuple) else [payload]
             if step.references is not None:
                 _receive_changes(step.references, step.t, agent, listed)
             # The part behind the values counts as communication alone.
@@ -88,7 +92,7 @@ def _choose_outgoing(
     f = step.filter
     if not f.share_observations or f.graph is None:
         return []
-    waiting: tuple[Observation, ...] = step.state.pending
+    waiting = cast(SensorState, step.state).pending
     if step.channel is None:
         if f.lag:
             _refuse_waiting_changes(step, observed)
@@ -127,13 +131,13 @@ def _refuse_waiting_changes(
                 )
 
 
-def _pack(step: Step[AnyState], sent: list[list[Observation]]) -> list[Any]:
+def _pack(step: Step[AnyState], sent: list[list[Observation]]) -> list[Payload | None]:
     """Pack each agent's observations into one payload; None if there is none.
 
     The usual case, one present observation of the agent's first sensor, is its value alone.
     Otherwise a last part holds the time, the number of the sensor and the metadata of each.
     """
-    payloads: list[Any] = []
+    payloads: list[Payload | None] = []
     for observations, numbers in zip(sent, _describe(step, sent), strict=True):
         values = [observation.value for observation in observations]
         if not values:
@@ -172,7 +176,9 @@ def _describe(step: Step[AnyState], sent: list[list[Observation]]) -> list[list[
     return described
 
 
-def _flood(step: Step[AnyState], sent: list[list[Observation]]) -> list[dict[int, Any]]:
+def _flood(
+    step: Step[AnyState], sent: list[list[Observation]]
+) -> Sequence[Mapping[int, Payload]]:
     """Send observations over several links; the values that each agent receives, by their agent.
 
     The number of the agent that made them travels with them.
@@ -213,22 +219,23 @@ def fuse_beliefs(step: Step[AnyState], values: tuple[Array, ...]) -> tuple[Array
     # A failed run's values may make the rule fail again, so those of a good run stand in.
     good = tuple(np.argwhere(~step.failed)[0])
     inputs = [step.keep_failed(v, v[good]).copy() for v in values]
-    # Any: they stand among the arrays, which are of floats.
-    run_numbers: Any = np.arange(math.prod(step.runs)).reshape(step.runs)
+    run_numbers = np.arange(math.prod(step.runs)).reshape(step.runs)
     channel = step.channel
     ledger = channel.ledger
     # The channels of the attempts that went through, each with the same ledger before.
     used: list[Channel] = []
 
-    def fuse_runs(*arrays: Any) -> tuple[Array, ...]:
+    def fuse_runs(*arrays: Array) -> tuple[Array, ...]:
         *beliefs, numbers, _, _ = arrays
-        attempt = channel.for_run(numbers, ledger)
-        results = _apply_rule(step.filter.fusion, beliefs, attempt)
+        attempt = channel.for_run(numbers.astype(np.intp), ledger)
+        # A rule of a family that fuses in a step is a function.
+        rule = cast(Callable[..., object], step.filter.fusion)
+        results = _apply_rule(rule, beliefs, attempt)
         used.append(attempt)
         return results
 
     # All runs at once, and one by one if that fails.
-    results = step.apply(fuse_runs, (*inputs, run_numbers), values)
+    results = step.apply(fuse_runs, (*inputs, run_numbers.astype(float)), values)
     if used:
         step.channel = _merge_channels(channel, used, run_numbers)
     if not step.any_failed:
@@ -237,26 +244,34 @@ def fuse_beliefs(step: Step[AnyState], values: tuple[Array, ...]) -> tuple[Array
     return tuple([step.keep_failed(new, old) for new, old in pairs])
 
 
-def _apply_rule(rule: Any, beliefs: list[Array], channel: Channel) -> tuple[Array, ...]:
+def _apply_rule(
+    rule: Callable[..., object], beliefs: list[Array], channel: Channel
+) -> tuple[Array, ...]:
     """Call a fusion rule, with one array or a tuple of them, and check its results."""
     is_single = len(beliefs) == 1
     fused = call_user(rule, beliefs[0] if is_single else tuple(beliefs), channel)
-    results = (fused,) if is_single else tuple(fused)
+    results: tuple[object, ...] = (fused,)
+    if not is_single:
+        results = tuple(fused) if isinstance(fused, Iterable) else ()
     if len(results) != len(beliefs):
         raise ValueError(
             f"fusion must return {len(beliefs)} arrays, got {len(results)}"
         )
-    checked = []
+    checked: list[Array] = []
     for new, old in zip(results, beliefs, strict=True):
-        is_array = type(new) is np.ndarray and new.dtype == np.float64
-        has_shape = is_array and new.shape == old.shape
-        if not has_shape or np.count_nonzero(np.isfinite(new)) < new.size:
-            new = check_array(new, "fusion", old.shape)
-        checked.append(new)
+        # Mostly it is an array that fits: then nothing has to be converted.
+        if type(new) is np.ndarray and new.dtype == np.float64:
+            fits = new.shape == old.shape
+            if fits and np.count_nonzero(np.isfinite(new)) == new.size:
+                checked.append(new)
+                continue
+        checked.append(check_array(new, "fusion", old.shape))
     return tuple(checked)
 
 
-def _merge_channels(before: Channel, used: list[Channel], run_numbers: Any) -> Channel:
+def _merge_channels(
+    before: Channel, used: list[Channel], run_numbers: Indices
+) -> Channel:
     """Return the channel whose ledger counts the fusion once.
 
     A batch is charged like one run. If only single runs could be fused, their messages cost the

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import Any
 
 import numpy as np
 
@@ -73,7 +72,7 @@ def recompute_rows(
     *,
     shared: Array,
     rng: np.random.Generator | None,
-    rng_state: Any,
+    rng_state: Mapping[str, object] | None,
     cause: Exception,
 ) -> tuple[tuple[Array, ...], dict[Row, str]]:
     """Compute each row of a batch alone after the batch as a whole has failed.
@@ -126,7 +125,7 @@ def recompute_rows(
     good = next(row for row in rows if row not in errors)
     indices = tuple(np.transpose([good if row in errors else row for row in rows]))
     substituted = [a[indices].reshape(a.shape) for a in arrays]
-    if rng is not None:
+    if rng is not None and rng_state is not None:
         rng.bit_generator.state = rng_state
     with suppress(*RECOVERABLE):
         results = compute(*substituted, shared, rng)

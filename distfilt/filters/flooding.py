@@ -11,12 +11,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..network import Channel
+from ..network.flood import find_opposite
 from ..validation import Array, Mask
 
 __all__ = ["Bundle", "flood_observations"]
 
 Bundle = tuple[Array, ...]
-"""The values of one agent's observations, (*runs, m) each; NaN in runs that do not have them."""
+"""The values of one agent's observations, with the axes of the runs first.
+
+They are NaN in runs that do not have them.
+"""
 
 
 def flood_observations(
@@ -51,7 +55,7 @@ def flood_observations(
     """
     flood = _Flood(channel, bundles, labels)
     rounds = 0
-    while any(flood.fresh) and rounds != hops:
+    while flood.fresh.any() and rounds != hops:
         flood.send_fresh()
         rounds += 1
     # An agent's own observations are not received.
@@ -61,9 +65,9 @@ def flood_observations(
 
 
 class _Flood:
-    """The observations that each agent knows, and those that it received in the last round.
+    """The observations that each agent has, and those that it received in the last round.
 
-    Messages are lost in some runs and not in others, so that everything holds run by run.
+    Messages are lost in some runs and not in others, so that every flag has the axes of the runs.
     """
 
     def __init__(
@@ -74,80 +78,85 @@ class _Flood:
     ) -> None:
         self.channel = channel
         self.labels = labels
-        self.known: list[dict[int, Bundle]] = []
-        # By agent and maker: the runs in which the agent has received the bundle just now.
-        self.fresh: list[dict[int, Mask]] = []
-        # By agent, maker and neighbour: the runs in which it came from that neighbour.
-        self.sources: dict[tuple[int, int, int], Mask] = {}
+        graph = channel.graph
+        n_agents = graph.n_agents
+        self.opposite = find_opposite(graph)
+        self.known: list[dict[int, Bundle]] = [{} for _ in bundles]
+        # By agent and maker: whether the agent has the maker's bundle.
+        self.present = np.zeros((n_agents, n_agents, *channel.runs), dtype=bool)
         for agent, bundle in enumerate(bundles):
-            self.known.append({} if bundle is None else {agent: bundle})
-            self.fresh.append({} if bundle is None else {agent: _find_present(bundle)})
+            if bundle is not None:
+                self.known[agent][agent] = bundle
+                self.present[agent, agent] = _find_present(bundle)
+        # Whether it has received the bundle in the last round.
+        self.fresh = self.present.copy()
+        # By link and maker: whether the bundle has come over the link; the last row stands for
+        # no link at all, as the opposite of one that goes one way.
+        n_links = graph.senders.size
+        self.came = np.zeros((n_links + 1, n_agents, *channel.runs), dtype=bool)
 
     def send_fresh(self) -> None:
-        """Send what is fresh over each link, but not back, and note what arrives."""
-        graph = self.channel.graph
-        ends = list(zip(graph.receivers.tolist(), graph.senders.tolist(), strict=True))
-        # For the bill by broadcast: the runs in which any receiver needs a bundle.
-        needed: list[dict[int, Mask]] = [{} for _ in self.fresh]
-        makers_by_link: list[list[int]] = []
-        payloads: list[Bundle | None] = []
-        for receiver, sender in ends:
-            wanted: dict[int, Mask] = {}
-            for maker, is_fresh in self.fresh[sender].items():
-                came_back = self.sources.get((sender, maker, receiver), False)
-                mask = np.asarray(is_fresh & ~np.asarray(came_back))
-                if mask.any():
-                    wanted[maker] = mask
-                    before = needed[sender].get(maker, False)
-                    needed[sender][maker] = np.asarray(mask | before)
-            makers_by_link.append(list(wanted))
-            payloads.append(self._pack(sender, wanted))
-        common = [self._pack(agent, wanted) for agent, wanted in enumerate(needed)]
+        """Send the fresh bundles over each link over which they have not come."""
+        senders = self.channel.graph.senders
+        # Split horizon: the sender of the opposite link has what came over it.
+        wanted = self.fresh[senders] & ~self.came[self.opposite]
+        payloads = []
+        for link, sender in enumerate(senders.tolist()):
+            payloads.append(self._pack(sender, wanted[link]))
+        # One transmission for all receivers holds the bundles that any of them needs.
+        needed = np.zeros_like(self.fresh)
+        np.logical_or.at(needed, senders, wanted)
+        common = [self._pack(agent, rows) for agent, rows in enumerate(needed)]
         arrived = self.channel.unicast(payloads, common=common)
-        self.fresh = [{} for _ in self.fresh]
-        for (receiver, sender), makers, payload in zip(
-            ends, makers_by_link, arrived, strict=True
-        ):
+        self.fresh = np.zeros_like(self.fresh)
+        for link, payload in enumerate(arrived):
             if payload is not None:
-                self._receive(receiver, sender, makers, payload)
+                self._receive(link, wanted[link], payload)
 
-    def _pack(self, agent: int, wanted: dict[int, Mask]) -> Bundle | None:
-        """Return the payload of some bundles, in the runs that want them."""
+    def _pack(self, agent: int, wanted: Mask) -> Bundle | None:
+        """Return the payload of an agent's bundles in the runs (A, *runs) that want them."""
         parts: list[Array] = []
         runs = self.channel.runs
-        for maker, mask in wanted.items():
+        for maker in _list_makers(wanted):
+            mask = wanted[maker, ..., None]
             for value in self.known[agent][maker]:
-                parts.append(np.where(mask[..., None], value, np.nan))
+                parts.append(np.where(mask, value, np.nan))
+            # The same label in all runs
             label = self.labels[maker]
             parts.append(np.broadcast_to(label, (*runs, label.size)))
         return tuple(parts) if parts else None
 
-    def _receive(
-        self, receiver: int, sender: int, makers: list[int], payload: Bundle
-    ) -> None:
-        """Add the bundles in a message to those that the receiver knows."""
+    def _receive(self, link: int, wanted: Mask, payload: Bundle) -> None:
+        """Add the bundles in a message to those that the receiver has."""
+        receiver = int(self.channel.graph.receivers[link])
+        sender = int(self.channel.graph.senders[link])
         start = 0
-        box = self.known[receiver]
-        for maker in makers:
+        for maker in _list_makers(wanted):
             stop = start + len(self.known[sender][maker])
             bundle = payload[start:stop]
             # The label follows the values.
             start = stop + 1
             arrived = _find_present(bundle)
-            key = (receiver, maker, sender)
-            before = self.sources.get(key, False)
-            self.sources[key] = np.asarray(arrived | before)
-            is_new = arrived
-            if maker in box:
-                is_new = arrived & ~_find_present(box[maker])
-                pairs = zip(bundle, box[maker], strict=True)
-                bundle = tuple(
-                    [np.where(is_new[..., None], new, old) for new, old in pairs]
-                )
+            self.came[link, maker] |= arrived
+            is_new = arrived & ~self.present[receiver, maker]
             if is_new.any():
-                box[maker] = bundle
-                earlier = self.fresh[receiver].get(maker, False)
-                self.fresh[receiver][maker] = np.asarray(is_new | earlier)
+                self._keep(receiver, maker, bundle, is_new)
+
+    def _keep(self, agent: int, maker: int, bundle: Bundle, is_new: Mask) -> None:
+        """Take the values of a bundle in the runs in which it is new to an agent."""
+        box = self.known[agent]
+        old = box.get(maker, bundle)
+        mask = is_new[..., None]
+        values = [np.where(mask, new, v) for new, v in zip(bundle, old, strict=True)]
+        box[maker] = tuple(values)
+        self.present[agent, maker] |= is_new
+        self.fresh[agent, maker] |= is_new
+
+
+def _list_makers(wanted: Mask) -> list[int]:
+    """Return the makers whose bundles some run wants."""
+    by_maker = wanted.reshape(len(wanted), -1)
+    return [int(maker) for maker in np.flatnonzero(by_maker.any(axis=1))]
 
 
 def _find_present(bundle: Bundle) -> Mask:

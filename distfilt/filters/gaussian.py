@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property, partial
-from typing import Annotated, Any, ClassVar, Literal, Self, cast
+from typing import Annotated, ClassVar, Literal, Self, cast
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from ..validation import (
     Bounds,
     NonNegativeFloat,
     PositiveInt,
+    Rng,
     all_finite,
     format_number,
 )
@@ -46,7 +47,7 @@ from .options import (
 from .priors import Prior, moments_by_agent
 from .record import Summary
 from .resets import Reset, reset_gaussian
-from .states import SensorState
+from .states import SensorState, State
 from .step import Received, Step
 
 __all__ = ["GaussianFamily", "GaussianFilter", "GaussianState"]
@@ -92,7 +93,8 @@ class GaussianState(SensorState):
     @property
     def times(self) -> tuple[float, ...]:
         """The earlier times whose beliefs are kept, oldest first."""
-        return self.history[::-1]
+        times = [entry for entry in self.history if not isinstance(entry, tuple)]
+        return tuple(times[::-1])
 
     @property
     def lagged_states(self) -> tuple[Self, ...]:
@@ -136,7 +138,7 @@ class GaussianFamily(
     kappa: NonNegativeFloat = 1.0
     inflation: Annotated[float, Bounds(at_least=0.5)] = 1.0
 
-    state_class: ClassVar[type[Any]] = GaussianState
+    state_class: ClassVar[type[State]] = GaussianState
     batched_summary: ClassVar[bool] = True
 
     @cached_property
@@ -154,8 +156,8 @@ class GaussianFamily(
             )
 
     def initial_state(
-        self, prior: Prior, runs: tuple[int, ...], rng: Any
-    ) -> dict[str, Any]:
+        self, prior: Prior, runs: tuple[int, ...], rng: Rng | None
+    ) -> dict[str, object]:
         """Return the prior's mean and covariance, the same for all runs."""
         d = self.model.dim
         mean, cov = moments_by_agent(prior, d, self.n_agents)
@@ -170,7 +172,7 @@ class GaussianFamily(
 
     def reset_belief(self, state: GaussianState, reset: Reset) -> GaussianState:
         """Return the state with a new belief about some components."""
-        return cast(GaussianState, reset_gaussian(state, reset))
+        return reset_gaussian(state, reset)
 
     def next_state(self, step: Step[GaussianState]) -> GaussianState:
         """Forecast, condition on the received observations, fuse.
@@ -602,6 +604,6 @@ def _condition_rows(
     innovation: Array,
     slope: Array,
     noise: Array,
-    *_: Any,
+    *_: object,
 ) -> tuple[Array, Array]:
     return condition(mean, cov, innovation, slope, noise)

@@ -157,11 +157,13 @@ class GridFilter(
     ) -> dict[str, Any]:
         """Return the prior's density at the centres, times the cells' volume."""
         centres = self.grid.centres
+        # A distribution of scipy has a density; any other prior is a mixture or a Gaussian.
         if hasattr(prior, "logpdf"):
             logs = np.broadcast_to(prior.logpdf(centres), (self.n_agents, len(centres)))
         else:
             mixtures = prior_mixtures(prior, self.model.dim, self.n_agents)
             logs = np.array([mixture.log_density(centres) for mixture in mixtures])
+        # ∫ p(x) dx as a sum over the cells
         total = np.exp(log_sum_exp(logs)) * self.grid.volume
         if (total < 0.5).any():
             raise ValueError(
@@ -178,10 +180,11 @@ class GridFilter(
         for _, group in step.received():
             self._weight(logs, group, step)
         if step.has_fusion and self.fused == "likelihoods":
-            # log p(y | x) + a constant: what the own observations have added
+            # log p(y | x) + a constant: the change by the own observations
             (averaged,) = step.fuse(logs - _normalize(forecast))
             logs = _normalize(forecast + self.n_agents * averaged)
         elif step.has_fusion:
+            # Π p_i^(1/A), normalised: the geometric mean of the beliefs
             (averaged,) = step.fuse(logs)
             logs = _normalize(averaged)
         return step.end(log_masses=logs)
@@ -207,11 +210,14 @@ class GridFilter(
         t = step.state.t
         moved = self.model.step(self.grid.centres, t, step.dt)
         noise = self.model.Q(t, step.dt)
+        # A state that rests is not spread by the grid.
         if not noise.any() and np.array_equal(moved, self.grid.centres):
             return old
         matrix = _transition_matrix(self.grid, moved.tobytes(), noise.tobytes())
+        # All runs and agents in one sparse product
         columns = step.state.masses.reshape(-1, old.shape[-1]).T
         forecast = (matrix @ columns).T.reshape(old.shape)
+        # Columns of the matrix sum to less than 1 near the sides of the box.
         total = forecast.sum(axis=-1)
         if (total < 0.99).any():
             step.warn_once(
@@ -234,6 +240,7 @@ class GridFilter(
         members = np.broadcast_to(self.grid.centres, (*lead, *self.grid.centres.shape))
         predicted = group.predict(members, branch="each")
         if not all_finite(predicted):
+            # A cell that cannot see contradicts what was seen, unless none can.
             is_blind = np.asarray(np.isnan(predicted).all(axis=-2))
             is_blind = np.broadcast_to(is_blind, group.target.shape)
             step.note_unseen(group, is_blind, "no cell can see")
@@ -249,6 +256,7 @@ class GridFilter(
         )
         group, likelihoods = group.log_likelihood(members)
 
+        # log p_i + log p(y | x_i)
         joint = old + likelihoods
         joint = joint + particles.log_likelihood(
             predicted, group.target, group.noise, contradict=True
@@ -291,6 +299,7 @@ def _transition_matrix(grid: Grid, moved: bytes, noise: bytes) -> csr_array:
     from scipy.spatial import KDTree
 
     d = grid.dim
+    # Bytes are the key of the cache, since arrays cannot be.
     points = np.frombuffer(moved).reshape(-1, d)
     cov = np.frombuffer(noise).reshape(d, d)
     # In units of a cell, the narrowest direction of the noise

@@ -154,6 +154,7 @@ class LikelihoodConsensusFilter(ParticleFamily):
                 "delayed must be empty here, where the agents exchange likelihoods of the present "
                 f"state, got {len(step.delayed)} observations"
             )
+        # Each agent weights a copy by its own observations, as any particle filter does.
         own = log_weights.copy()
         super()._assimilate(own, stack, origin, step)
         if not step.has_fusion:
@@ -197,12 +198,14 @@ class LikelihoodConsensusFilter(ParticleFamily):
         weights = is_alive / is_alive.sum(axis=-1, keepdims=True)
         centred = values - (weights[..., None, :] @ values)
         centred = np.where(is_alive[..., None], centred, 0.0)
+        # Functions of unit spread have coefficients of like size.
         spread = np.sqrt((centred**2).mean(axis=-2, keepdims=True))
         spread = np.where(spread > 0, spread, 1.0)
         target = logs - (weights * logs).sum(axis=-1, keepdims=True)
         target = np.where(is_alive, target, 0.0)
-        # α of least squares, with functions of unit spread
+        # α of least squares
         inverse = np.linalg.pinv(centred / spread, rcond=_CUT)
         fitted = (inverse @ target[..., None])[..., 0] / spread[..., 0, :]
         (averaged,) = step.fuse(fitted)
+        # Σ_p (Σ_i α_ip) φ_p(x), with A times the average for the sum
         return np.asarray(self.n_agents * (values @ averaged[..., None])[..., 0])

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
-from typing import Annotated, Any, ClassVar, cast
+from typing import Annotated, ClassVar, cast
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from ..mixtures import GaussianMixture, runnalls
 from ..mixtures.conditioning import propagate_mixture, update_mixture, within_gate
 from ..mixtures.fusion import align_mixture
 from ..mixtures.splitting import split_nonlinear
+from ..network import Channel
 from ..periods import (
     Periods,
     check_sensor,
@@ -22,7 +23,14 @@ from ..periods import (
     step_members,
     warn_of_wrapping,
 )
-from ..validation import Array, Bounds, InvalidArgumentError, PositiveInt, call_user
+from ..validation import (
+    Array,
+    Bounds,
+    InvalidArgumentError,
+    PositiveInt,
+    Rng,
+    call_user,
+)
 from .base import SensorFilter
 from .observations import Observation, sensor_of
 from .options import ExchangesAtIntervals, FusesBeliefs
@@ -32,6 +40,9 @@ from .states import State
 from .step import Step, predict_points
 
 __all__ = ["MixtureFilter", "MixtureState", "TargetMixtureFilter"]
+
+MixtureRule = Callable[[list[GaussianMixture], Channel], Iterable[object]]
+"""A fusion rule: it gets all agents' mixtures and the channel, and returns as many."""
 
 _MAX_ALL_PAIRS = 400
 """Up to how many components every pair is a candidate for a merger."""
@@ -80,7 +91,7 @@ class TargetMixtureFilter(
     split_threshold: Annotated[float, Bounds(above=0, at_most=1e150)] | None = None
     split_scale: Annotated[Array, "model.dim"] | None = None
 
-    state_class: ClassVar[type[Any]] = MixtureState
+    state_class: ClassVar[type[State]] = MixtureState
     supports_runs: ClassVar[bool] = False
 
     def check_parts(self) -> None:
@@ -95,8 +106,8 @@ class TargetMixtureFilter(
         Bounds(at_least=self.n_components)(self.max_components, "max_components")
 
     def initial_state(
-        self, prior: Prior, runs: tuple[int, ...], rng: Any
-    ) -> dict[str, Any]:
+        self, prior: Prior, runs: tuple[int, ...], rng: Rng | None
+    ) -> dict[str, object]:
         """Return a mixture for each agent."""
         mixtures = prior_mixtures(prior, self.model.dim, self.n_agents)
         settled = [settle_mixture(mixture, self.periods) for mixture in mixtures]
@@ -373,7 +384,8 @@ class MixtureFilter(TargetMixtureFilter, FusesBeliefs[MixtureState]):
         self, beliefs: list[GaussianMixture], step: Step[MixtureState]
     ) -> list[GaussianMixture]:
         """Apply the fusion rule and check its results."""
-        rule = cast(Any, self.fusion)
+        # Mixtures have a rule of their own, with a list of them.
+        rule = cast(MixtureRule, self.fusion)
         if self.periods:
             # All agents' means on one branch.
             settled = [settle_mixture(belief, self.periods) for belief in beliefs]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from ..validation import (
     NonNegativeInt,
@@ -63,8 +63,9 @@ class SharesObservations(Filter[S]):
     hops : int or "all"
         Over how many links an observation travels: 1 for the neighbours; more if agents forward
         it in the same step, each once and never back to a neighbour from which it came; "all"
-        until all agents of a connected graph have it. The number of the agent that made it is
-        sent too, unless `hops` is 1.
+        until all agents of a connected graph have it. If no message is lost the graph's diameter
+        is enough, and saves a last round in which nothing is new. The number of the agent that
+        made it is sent too, unless `hops` is 1.
 
     Examples
     --------

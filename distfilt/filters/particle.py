@@ -5,19 +5,27 @@ from __future__ import annotations
 import math
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from ..linalg import log_sum_exp
 from ..periods import check_transition, fold, settle, warn_of_wrapping
 from ..updates import particles
-from ..validation import Array, Indices, Mask, UnitInterval, all_finite, format_number
+from ..validation import (
+    Array,
+    Indices,
+    Mask,
+    Rng,
+    UnitInterval,
+    all_finite,
+    format_number,
+)
 from .ensemble import AtLeastTwo, MembersFilter, fuse_members, regress_past
 from .options import ExchangesAtIntervals, SharesObservations
 from .priors import Prior
 from .record import Summary
-from .states import SensorState
+from .states import SensorState, State
 from .step import Received, Step, copy_rng
 
 __all__ = ["ParticleFamily", "ParticleFilter", "ParticleState"]
@@ -56,7 +64,7 @@ class ParticleState(SensorState):
 
     particles: Array
     log_weights: Array
-    ancestors: Any = field(default=None, kw_only=True)
+    ancestors: Indices | None = field(default=None, kw_only=True)
 
     belief_field = "particles", (..., "A", "N", "d")
 
@@ -83,13 +91,13 @@ class ParticleFamily(MembersFilter[ParticleState]):
     ess_threshold: UnitInterval = 0.5
     jitter: UnitInterval | None = None
 
-    state_class: ClassVar[type[Any]] = ParticleState
+    state_class: ClassVar[type[State]] = ParticleState
     batched_summary: ClassVar[bool] = True
     supports_likelihoods: ClassVar[bool] = True
 
     def initial_state(
-        self, prior: Prior, runs: tuple[int, ...], rng: Any
-    ) -> dict[str, Any]:
+        self, prior: Prior, runs: tuple[int, ...], rng: Rng | None
+    ) -> dict[str, object]:
         """Draw particles for each agent, with equal weights."""
         drawn = self.draw_prior(prior, (*runs, self.n_agents), rng)
         drawn = settle(drawn, self.periods)
@@ -224,7 +232,9 @@ class ParticleFamily(MembersFilter[ParticleState]):
             total = log_sum_exp(joint)[..., 0] + normalizer
             step.add_log_likelihood(total, group.agents)
 
-        def compute(h: Array, y: Array, logs: Array, noise: Array, _: Any) -> Any:
+        def compute(
+            h: Array, y: Array, logs: Array, noise: Array, _: object
+        ) -> tuple[Array]:
             return (particles.reweight(logs, h, y, noise),)
 
         (new,) = step.apply(
@@ -356,12 +366,12 @@ class ParticleFamily(MembersFilter[ParticleState]):
         agents: Mask,
         offset: Array,
         ancestors: Indices,
-    ) -> Any:
+    ) -> Indices:
         """Resample some agents' paths in the stack and their ancestors; weights are equal then.
 
         Returns how often each particle was taken.
         """
-        rows: Any = slice(None) if agents.all() else agents
+        rows: slice | Mask = slice(None) if agents.all() else agents
         counts = particles.systematic_counts(weights[rows], offset[rows])
         for k, path in enumerate(stack):
             taken = particles.repeat_by_count(path[rows], counts)
@@ -495,7 +505,7 @@ below half of this number, a warning is given."""
 def find_ancestors(state: ParticleState) -> Indices:
     """Return the ancestors of a state's particles, a copy; by default each is its own."""
     shape = state.log_weights.shape
-    ancestors: Indices | None = state.ancestors
+    ancestors = state.ancestors
     if ancestors is not None and ancestors.shape == shape:
         return ancestors.copy()
     return np.broadcast_to(np.arange(shape[-1]), shape).copy()

@@ -95,6 +95,13 @@ def prior_moments(
         )
     cov = cov.reshape(dim, dim)
     if definiteness == "definite":
+        constant = np.flatnonzero(cov.diagonal() == 0)
+        if constant.size:
+            raise ValueError(
+                "prior must be a positive definite matrix here, got the variance 0 of "
+                f"component {constant[0]}: give a known constant a small variance, or use a "
+                "GaussianFilter or members"
+            )
         check_positive_definite(cov, "prior")
     else:
         check_positive_semidefinite(cov, "prior")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,13 @@ from ..validation import (
     check_distinct,
     check_positive_semidefinite,
 )
+
+if TYPE_CHECKING:
+    from .gaussian import GaussianState
+    from .states import SensorState
+
+Gaussians = TypeVar("Gaussians", bound="GaussianState")
+Members = TypeVar("Members", bound="SensorState")
 
 __all__ = ["Reset", "read_reset", "reset_gaussian", "reset_members"]
 
@@ -89,7 +96,7 @@ def _repeat_value(constant: Array, x: Array) -> Array:
     return np.broadcast_to(constant, (*x.shape[:-1], constant.size))
 
 
-def reset_gaussian(state: Any, reset: Reset) -> Any:
+def reset_gaussian(state: Gaussians, reset: Reset) -> Gaussians:
     """Return a Gaussian state with new present components; the past keeps the former ones."""
     d = state.dim
     rows = (..., reset.agents, slice(None))
@@ -114,11 +121,11 @@ def reset_gaussian(state: Any, reset: Reset) -> Any:
 
 
 def reset_members(
-    state: Any,
+    state: Members,
     reset: Reset,
-    draw_normal: Callable[[tuple[int, ...], Any], Array],
+    draw_normal: Callable[[tuple[int, ...], np.random.Generator], Array],
     rng: np.random.Generator,
-) -> Any:
+) -> Members:
     """Return a state of members with new present components; the past keeps the former ones."""
     name, _ = state.belief_field
     members = state.belief.copy()

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from os import PathLike
-from typing import TYPE_CHECKING, Annotated, Any, Self, TypeVar, cast
+from types import EllipsisType
+from typing import TYPE_CHECKING, Annotated, Self, TypeVar, cast
 
 import numpy as np
 
@@ -21,7 +22,19 @@ from ..validation import (
 from .serialization import load_fields, save_state
 
 if TYPE_CHECKING:
-    pass
+    from .changes import Times
+    from .observations import Observation
+    from .repetition import Assimilated
+
+    Past = tuple[tuple[float, Array], ...]
+    History = tuple[tuple[float, Array] | float, ...]
+    Changes = tuple[tuple[int, int, Times], ...]
+    Assimilations = tuple[Assimilated, ...]
+    Pending = tuple[Observation, ...]
+    Axes = tuple[str | int | EllipsisType, ...]
+else:
+    # The library makes these values, so that their entries need no check.
+    Past = History = Changes = Assimilations = Pending = Axes = tuple[object, ...]
 
 __all__ = ["SensorState", "State", "stack_states"]
 
@@ -71,7 +84,7 @@ class State(FrozenModel):
     n_observed: Annotated[Array, "...", ALLOW_NAN] | None = field(
         default=None, kw_only=True
     )
-    assimilated: tuple[Any, ...] = field(default=(), kw_only=True)
+    assimilated: Assimilations = field(default=(), kw_only=True)
     warned: tuple[str, ...] = field(default=(), kw_only=True)
 
     def __repr__(self) -> str:
@@ -87,6 +100,11 @@ class State(FrozenModel):
     @property
     def times(self) -> tuple[float, ...]:
         """The earlier times whose beliefs are kept, oldest first; none by default."""
+        return ()
+
+    @property
+    def lagged_states(self) -> tuple[Self, ...]:
+        """A state for each of these times, given all observations up to now; none by default."""
         return ()
 
     def lagged_times(self, lag: int, t: float) -> tuple[float, ...]:
@@ -165,17 +183,15 @@ class SensorState(State):
     (3,)
     """
 
-    # Pairs of a time and an array; a family may keep the times alone.
-    history: tuple[Any, ...] = field(default=(), kw_only=True)
+    history: History = field(default=(), kw_only=True)
     failed: Mask = field(default_factory=lambda: np.zeros((), dtype=bool), kw_only=True)
-    # Observations of the filter, which the generator of a step has checked.
-    pending: tuple[Any, ...] = field(default=(), kw_only=True)
-    last_changes: tuple[Any, ...] = field(default=(), kw_only=True)
-    references: tuple[Any, ...] = field(default=(), kw_only=True)
+    pending: Pending = field(default=(), kw_only=True)
+    last_changes: Changes = field(default=(), kw_only=True)
+    references: Past = field(default=(), kw_only=True)
     unseen: Annotated[Array, "..."] | None = field(default=None, kw_only=True)
 
     # Without an annotation it is no field of the dataclass.
-    belief_field = "belief", tuple[Any, ...]()
+    belief_field = "belief", Axes()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -197,7 +213,12 @@ class SensorState(State):
     @property
     def times(self) -> tuple[float, ...]:
         """The earlier times whose beliefs are kept, oldest first."""
-        return tuple([t for t, _ in self.history])
+        return tuple([t for t, _ in self.past])
+
+    @property
+    def past(self) -> Past:
+        """The earlier times and their beliefs, oldest first; of a family that keeps pairs."""
+        return tuple([entry for entry in self.history if isinstance(entry, tuple)])
 
     @property
     def lagged_states(self) -> tuple[Self, ...]:
@@ -229,7 +250,7 @@ class SensorState(State):
         """
         name, _ = self.belief_field
         states = []
-        for t, belief in self.history:
+        for t, belief in self.past:
             states.append(
                 self.replace(
                     t=t, history=(), last_changes=(), references=(), **{name: belief}

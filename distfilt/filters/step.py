@@ -9,19 +9,21 @@ from __future__ import annotations
 import copy
 import math
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
+from types import EllipsisType
 from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, cast
 
 import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
 from ..derivatives import needs_differences
 from ..linalg import cholesky, deviations, log_det, quadratic_form
 from ..models import Model
 from ..periods import check_sensor, gather
 from ..sensors import LikelihoodSensor, Sensor
-from ..validation import Array, Mask, call_user, format_number
+from ..validation import Array, Indices, Mask, call_user, format_number
 from ..validation.batching import name_of_check
 from ..validation.first_use import needs_check
 from . import failures
@@ -119,9 +121,8 @@ class Step(Generic[S]):
         reuse_rng: bool = False,
     ) -> None:
         # Only families with sensors use the parts that need them.
-        self.filter = cast("SensorFilter[Any]", filter_)
-        # A family's next_state knows the fields of its own state.
-        self.state: Any = state
+        self.filter = cast("SensorFilter[S]", filter_)
+        self.state = state
         self.t = t
         # At the state's own time nothing is forecast: dt = 0.
         self.dt = t - state.t
@@ -151,10 +152,9 @@ class Step(Generic[S]):
         # Sensors of changes need the beliefs about the times of their last observations.
         self.lagged = self.times
         self.references: References | None = None
-        sources = self.filter.change_sources if isinstance(state, SensorState) else ()
-        if sources:
-            before = cast(SensorState, self.state)
-            self.references = References(before, t, observations, sources)
+        if isinstance(state, SensorState) and self.filter.change_sources:
+            sources = self.filter.change_sources
+            self.references = References(state, t, observations, sources)
             times = {*self.lagged, *self.references.times}
             self.times = tuple(sorted(times))
         # Counted only with a gate.
@@ -177,8 +177,8 @@ class Step(Generic[S]):
             errors = failures.find_nonfinite_rows(values, lead, "forecast")
             self.record_failures(errors, range(self.filter.n_agents))
         # Groups of agents are updated in place, which must not change the state.
-        belief = getattr(self.state, self.state.belief_field[0])
-        if np.may_share_memory(values, belief):
+        before = cast(SensorState, self.state)
+        if np.may_share_memory(values, getattr(before, before.belief_field[0])):
             values = values.copy()
         return self.keep_failed(values, old) if self.any_failed else values
 
@@ -186,16 +186,17 @@ class Step(Generic[S]):
         """Return copies of the beliefs about the earlier times, then the present forecast."""
         if not self.times:
             return [forecast]
+        state = cast(SensorState, self.state)
         if self.references is not None:
-            beliefs = dict((*self.state.references, *self.state.history))
+            beliefs = dict((*state.references, *state.past))
             if self.dt > 0:
-                beliefs[self.state.t] = self.state.belief
+                beliefs[state.t] = state.belief
             return [beliefs[t].copy() for t in self.times] + [forecast]
         # The beliefs before the step: about the earlier times, and about the state's own time,
         # which is one of the earlier ones after a forecast.
-        before = [belief for _, belief in self.state.history]
+        before = [belief for _, belief in state.past]
         if self.dt > 0:
-            before.append(self.state.belief)
+            before.append(state.belief)
         # With a full lag the oldest time is dropped.
         oldest = len(before) - len(self.times)
         return [belief.copy() for belief in before[oldest:]] + [forecast]
@@ -233,7 +234,7 @@ class Step(Generic[S]):
         """Return by time, and then by agent, the sensors and values that each agent has."""
         f = self.filter
         if self.delayed or (f.graph is not None and f.share_observations):
-            return collect_observations(cast(Step[Any], self))
+            return collect_observations(self)
         # Nothing is exchanged here. A subclass may have put other agents' observations
         # into an agent's list, so a sensor is looked up at the agent that observed.
         pairs = []
@@ -265,7 +266,10 @@ class Step(Generic[S]):
             return None
         start = None
         if self.dt > 0:
-            start = self.state.t, self.state.belief if origin is None else origin
+            start = (
+                self.state.t,
+                cast(SensorState, self.state).belief if origin is None else origin,
+            )
         return self.references.find(group, past, self.times, start)
 
     def gate(
@@ -324,7 +328,7 @@ class Step(Generic[S]):
         innovation_cov = np.where(is_pair, cov + group.noise, unit)
         innovation = np.where(missing, 0.0, innovation)
 
-        def compute(r: Array, s: Array, *_: Any) -> tuple[Array, ...]:
+        def compute(r: Array, s: Array, *_: object) -> tuple[Array, ...]:
             # ε = rᵀ S⁻¹ r, and log det S
             lower = cholesky(s)
             return quadratic_form(lower, r), log_det(lower)
@@ -340,7 +344,7 @@ class Step(Generic[S]):
             log_density = -0.5 * (nis + log_volume + n_observed * _LOG_2PI)
             self.add_log_likelihood(log_density, group.agents)
 
-    def add_log_likelihood(self, values: Array, agents: Any) -> None:
+    def add_log_likelihood(self, values: Array, agents: Indices | slice) -> None:
         """Add values (*runs, G) to the recorded log-likelihood of these agents' observations."""
         self.scores["log_likelihood"][..., agents] += values
 
@@ -351,7 +355,7 @@ class Step(Generic[S]):
         compute: failures.Compute,
         arrays: tuple[Array, ...],
         fallback: tuple[Array, ...],
-        agents: Any = None,
+        agents: Sequence[int] | Indices | None = None,
         *,
         shared: Array = _NOTHING,
         rng: np.random.Generator | None = None,
@@ -378,7 +382,7 @@ class Step(Generic[S]):
         lead = len(self.runs) + (agents is not None)
         # The state of the generator, to draw the same numbers in a second attempt.
         is_batch = math.prod(arrays[0].shape[:lead]) > 1
-        rng_state: Any = None
+        rng_state: Mapping[str, object] | None = None
         if rng is not None and is_batch:
             rng_state = rng.bit_generator.state
         errors: dict[Row, str] = {}
@@ -409,7 +413,11 @@ class Step(Generic[S]):
             self.record_failures(errors, agents)
         return results
 
-    def record_failures(self, errors: dict[Row, str], agents: Any = None) -> None:
+    def record_failures(
+        self,
+        errors: dict[Row, str],
+        agents: Sequence[int] | Indices | None = None,
+    ) -> None:
         """Mark the runs of these errors as failed, or raise the first error.
 
         The keys are runs, and with `agents` end with a place among these.
@@ -465,7 +473,7 @@ class Step(Generic[S]):
 
     # The new state ---------------------------------------------------------------------
 
-    def end(self, *, past: Iterable[Array] = (), **belief: Any) -> S:
+    def end(self, *, past: Iterable[Array] = (), **belief: object) -> S:
         """Return the state after the step.
 
         Parameters
@@ -496,11 +504,11 @@ class Step(Generic[S]):
         return new
 
     def _describe_past(
-        self, past: Iterable[Array], belief: dict[str, Any]
-    ) -> dict[str, Any]:
+        self, past: Iterable[Array], belief: dict[str, object]
+    ) -> dict[str, object]:
         """Return the state's fields about the earlier times that the lag or a sensor keeps."""
         pairs = list(zip(self.times, past, strict=False))
-        fields: dict[str, Any] = {}
+        fields: dict[str, object] = {}
         # A family may keep its past in its own form; otherwise it is (time, belief) pairs.
         if "history" not in belief:
             fields["history"] = tuple(
@@ -559,16 +567,16 @@ class _Part(NamedTuple):
     """One sensor of a group: which agents have it, and where its numbers stand."""
 
     sensor: Sensor
-    agents: Any
+    agents: Indices | slice
     """Places of these agents in the group, or a slice if all have it."""
-    cells: tuple[Any, Any]
+    cells: tuple[Indices | slice, Indices | slice]
     """Index of the sensor's numbers in arrays (G, M)."""
 
 
-def _block_of(part: _Part) -> tuple[Any, ...]:
+def _block_of(part: _Part) -> tuple[Indices | slice | EllipsisType, ...]:
     """Return the index of a sensor's block in covariances (*runs, G, M, M)."""
     rows, columns = part.cells
-    if isinstance(rows, slice):
+    if isinstance(rows, slice) or isinstance(columns, slice):
         return (..., rows, columns, columns)
     return (..., rows[..., None], columns[..., :, None], columns[..., None, :])
 
@@ -613,7 +621,7 @@ class Received:
         self.agents = np.array(agents, dtype=np.intp)
         # A slice gives views, where a list of numbers copies.
         is_everybody = agents == list(range(len(sensors)))
-        self.rows: Any = slice(None) if is_everybody else self.agents
+        self.rows: Indices | slice = slice(None) if is_everybody else self.agents
         size = sum(sensor.dim for sensor in sensors[agents[0]])
         # Which of its agent's sensors each number belongs to, for the gate.
         self.sensor_index = np.zeros((len(agents), size), dtype=np.intp)
@@ -667,10 +675,10 @@ class Received:
         """Whether all agents of the group have the same sensors, in the same order."""
         n_agents = len(self.agents)
         for part in self.parts:
-            if isinstance(part.agents, slice):
+            _, columns = part.cells
+            if isinstance(part.agents, slice) or isinstance(columns, slice):
                 continue
             # A sensor that an agent has twice is listed twice.
-            _, columns = part.cells
             firsts = np.unique(columns[:, 0])
             if len(part.agents) != n_agents * len(firsts):
                 return False
@@ -715,6 +723,7 @@ class Received:
             members = states[..., part.agents, :, :]
             values = sensor.evaluate(members, observed[..., None, :])
             # An agent may have several observations of one sensor.
+            # Any: numpy's types of `at` have no index of several axes.
             index: Any = (..., part.agents, slice(None))
             np.add.at(logs, index, values)
         rest = self.with_target(target)
@@ -1038,7 +1047,9 @@ def group_agents(
 class _Unseeded(np.random.bit_generator.ISeedSequence):
     """A seed of a bit generator whose state is set afterwards."""
 
-    def generate_state(self, n_words: int, dtype: Any = np.uint32) -> Any:
+    def generate_state(
+        self, n_words: int, dtype: DTypeLike = np.uint32
+    ) -> NDArray[np.uint32 | np.uint64]:
         return np.zeros(n_words, dtype)
 
 

@@ -143,6 +143,7 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
                 "prior must have equally many components for all agents, got "
                 f"{sorted(counts)}"
             )
+        # One row of components for each agent; a weight of zero gets a finite logarithm.
         arrays = {
             "component_means": np.array([mixture.means for mixture in mixtures]),
             "component_covariances": np.array([mixture.covs for mixture in mixtures]),
@@ -179,6 +180,7 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         )
         mean = state.mask_failed(mean)
         cov = state.mask_failed(cov)
+        # N_eff = 1 / Σ w²
         size = state.mask_failed(1 / (state.weights**2).sum(axis=-1))
         variance = np.diagonal(cov, axis1=-2, axis2=-1)
         return Summary(mean, variance, cov, numbers={"effective_size": size})
@@ -197,6 +199,7 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
             dim=state.dim,
         )
         means, covs = self._forecast(bank)
+        # Back behind the agents, in arrays that may be changed in place.
         means = np.array(means.swapaxes(-3, -2))
         covs = np.array(covs.swapaxes(-4, -3))
         # Failed runs get harmless Gaussians, so that the batch can go on.
@@ -220,6 +223,7 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         is_blind = np.isnan(predicted)
         reason = "no component can see"
         step.note_unseen(group, np.asarray(is_blind.all(axis=-2)), reason)
+        # The gate tests the whole mixture's prediction: Σ w_l N(y; h(m_l), H_l P_l H_lᵀ).
         predicted_cov = slope @ cov @ slope.mT + extra
         group = step.gate(
             group,
@@ -232,11 +236,12 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         )
         target = group.target[..., None, :]
         innovation = target - predicted
-        # A component that cannot see what others can contradicts it.
+        # A component that cannot see an observation contradicts it, if others can see it.
         is_seen = ~is_blind.all(axis=-2, keepdims=True) & ~np.isnan(target)
         contradicts = (is_blind & is_seen).any(axis=-1)
         noise = (group.noise[:, None] if group.noise.ndim == 3 else group.noise) + extra
         prior = np.where(contradicts, _LEAST, logs)
+        # All components of all agents and runs at once, or run by run if one fails.
         new = step.apply(
             _condition_bank,
             (mean, cov, prior, innovation, slope, noise),
@@ -252,6 +257,7 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         self, mean: Array, cov: Array, group: Received
     ) -> tuple[Array, Array, Array]:
         """Return predictions (*runs, G, L, M), slopes, and extra covariances of components."""
+        # Components stand among the runs, so that a group predicts for each of them.
         mean = np.ascontiguousarray(mean.swapaxes(-3, -2))
         cov = np.ascontiguousarray(cov.swapaxes(-4, -3))
         # The group's target for each component.
@@ -264,6 +270,7 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
             cov,
             group.linear,
         )
+        # Where the derivative does not exist the sensor cannot be used either.
         is_blind = np.asarray(np.isnan(slope).any(axis=-1))
         predicted = np.where(is_blind, np.nan, predicted)
         slope = np.where(is_blind[..., None], 0.0, slope)
@@ -292,9 +299,11 @@ def _condition_bank(
     innovation_cov = slope @ cov @ slope.mT + noise
     unit = np.eye(innovation.shape[-1])
     lower = cholesky(np.where(is_pair, innovation_cov, unit))
+    # log N(r; 0, S) of each component
     squares = quadratic_form(lower, np.where(missing, 0.0, innovation))
     count = (~missing).sum(axis=-1)
     log_density = -0.5 * (squares + log_det(lower) + count * np.log(2 * np.pi))
+    # w_l N(r; 0, S_l), and its sum: the density of the observations
     joint = logs + log_density
     total = log_sum_exp(joint)
     new_mean, new_cov = condition(mean, cov, innovation, slope, noise)

@@ -47,11 +47,11 @@ class ChannelFilterState(GaussianState):
 
 @dataclass(frozen=True, eq=False)
 class ChannelFilter(GaussianFamily):
-    """Kalman filters of agents on a tree, which send neighbours what these do not know yet.
+    """Kalman filters of agents on a tree, which send neighbours only new information.
 
     Each agent assimilates its own observations and sends its belief. On each link both ends keep
-    the belief that they have in common, forecast it as their own, and subtract it from what
-    arrives: see :func:`distfilt.network.fuse_on_tree`. For linear models without process noise
+    the belief that they have in common, forecast it as their own, and subtract it from the
+    received one: see :func:`distfilt.network.fuse_on_tree`. For linear models without process noise
     every agent's belief is exactly that from all observations that have reached it, one link a
     step. With process noise it is an approximation.
 
@@ -99,16 +99,17 @@ class ChannelFilter(GaussianFamily):
     def initial_state(
         self, prior: Prior, runs: tuple[int, ...], rng: Any
     ) -> dict[str, Any]:
-        """Return the prior for the agents, and for the links as what they have in common."""
+        """Return the prior for the agents, and for the links as their common belief."""
         fields = super().initial_state(prior, runs, rng)
-        means = fields["joint_means"]
-        covs = fields["joint_covariances"]
+        means = np.asarray(fields["joint_means"])
+        covs = np.asarray(fields["joint_covariances"])
         if np.ptp(means, axis=-2).any() or np.ptp(covs, axis=-3).any():
             raise ValueError(
                 "prior must be one for all agents, of which the links begin, got a list"
             )
         # A known constant has no information matrix.
         check_positive_definite(covs, "prior")
+        # Both ends of each link begin with the common prior.
         n_links = self.graph.senders.size
         fields["link_means"] = np.repeat(means[..., :1, :], n_links, axis=-2)
         fields["link_covariances"] = np.repeat(covs[..., :1, :, :], n_links, axis=-3)
@@ -121,6 +122,7 @@ class ChannelFilter(GaussianFamily):
                 "agents must be all of them, whose neighbours have to know of it, got "
                 f"{len(reset.agents)} of {self.n_agents}"
             )
+        # The links forget as the agents do, or the common belief would no longer be common.
         links = self._join_links(state, only_links=True)
         of_links = reset._replace(agents=list(range(self.graph.senders.size)))
         changed = reset_gaussian(links, of_links)
@@ -136,6 +138,7 @@ class ChannelFilter(GaussianFamily):
         together.state = self._join_links(step.state)
         all_means, all_covs = self._forecast(together)
         unit = np.eye(self.model.dim)
+        # Copies, in which groups of agents are updated in place
         means = step.check_forecast(all_means[..., :n, :].copy(), 0.0)
         covs = step.check_forecast(all_covs[..., :n, :, :].copy(), unit)
         for place, group in step.received():
@@ -145,6 +148,7 @@ class ChannelFilter(GaussianFamily):
         link_means = step.keep_failed(all_means[..., n:, :], 0.0)
         link_covs = step.keep_failed(all_covs[..., n:, :, :], unit)
         if step.channel is not None:
+            # Y_i + Σ (Y_j - Y_ij), and the links' new common beliefs
             belief, common = fuse_on_tree(
                 (means, covs), (link_means, link_covs), step.channel
             )

@@ -97,16 +97,19 @@ def intersect_inverses(
     (array([0.6]), array([[1.2]]))
     """
     transform, d, z = _diagonalise(mean_a, cov_a, mean_b, cov_b)
+    # tr T diag(p) Tᵀ = Σ_k p_k |t_k|² with the columns t_k
     scale = (transform**2).sum(axis=-2)
 
     def variances(weight: Array) -> Array:
         """Return the variances in the common coordinates, (..., d), for weights (...)."""
+        # P_a, P_b and their mixture are I, D and ω + (1 - ω) D.
         w = weight[..., None]
         return np.asarray(1 / (1 + 1 / d - 1 / (w + (1 - w) * d)))
 
     def size(weights: Array) -> Array:
         # The points of the search come last: (..., points).
         p = np.stack([variances(w) for w in np.moveaxis(weights, -1, 0)], axis=-2)
+        # log det P is Σ log p_k and a constant.
         if rule == "min_trace":
             return np.asarray((scale[..., None, :] * p).sum(axis=-1))
         return np.asarray(np.log(p).sum(axis=-1))
@@ -238,6 +241,7 @@ def intersect_split(
         return np.stack(values, axis=-1)
 
     weight = _choose_weight(omega, size, leading)
+    # The gains K = P A⁻¹ and L = P B⁻¹, which add up to I
     a, b = informations(weight)
     total = symmetrise(a + b)
     gain_a = solve_definite(total, a)
@@ -281,8 +285,8 @@ def unite_gaussians(
 
     Notes
     -----
-    J. K. Uhlmann, Information Fusion 4 (2003) 201-215; S. Reece and S. Roberts, Conference on
-    Information Fusion (2006).
+    J. K. Uhlmann, Information Fusion 4 (2003) 201-215; S. Reece and S. Roberts, IEEE Transactions
+    on Aerospace and Electronic Systems 46 (2010) 207-221.
 
     Examples
     --------
@@ -294,6 +298,7 @@ def unite_gaussians(
     leading = broadcast_leading(leading, cov_a.shape[:-2], "cov_a")
     leading = broadcast_leading(leading, cov_b.shape[:-2], "cov_b")
     difference = np.broadcast_to(mean_b - mean_a, (*leading, mean_a.shape[-1]))
+    # (m_b - m_a)(m_b - m_a)ᵀ, of which the mean at ω takes ω² and (1 - ω)².
     square = difference[..., :, None] * difference[..., None, :]
 
     def cover(weight: Array) -> Array:

@@ -94,17 +94,20 @@ def gaussian_belief_propagation(
         rounds = max(graph.diameter, 1) if graph.is_connected else graph.n_agents
     for _ in range(rounds):
         matrix, vector = _collect(matrices, vectors, received, channel)
-        # All that the sender knows, but for what came from the receiver itself
+        # M and h: all that the sender knows without the receiver's own message
         known, eta = unpack_information(received, d)
         m = matrix[..., graph.senders, :, :] - known[..., reverse, :, :]
         h = vector[..., graph.senders, :] - eta[..., reverse, :]
+        # Λ = -J_ij M⁻¹ J_ji and η = -J_ij M⁻¹ h in one solve
         right = np.concatenate(
             [np.broadcast_to(couplings.mT, m.shape), h[..., None]], axis=-1
         )
         message = -couplings @ solve_definite(m, right)
         packed = pack_information(symmetrise(message[..., :d]), message[..., d])
+        # A lost message leaves the last one in place.
         arrived = channel.send_on_links(packed)
         received = np.where(np.isnan(arrived), received, arrived)
+    # The marginal: P_i⁻¹ = J_ii + Σ Λ and P_i⁻¹ m_i = h_i + Σ η
     matrix, vector = _collect(matrices, vectors, received, channel)
     covs = symmetrise(_invert(matrix))
     return (covs @ vector[..., None])[..., 0], covs

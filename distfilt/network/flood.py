@@ -67,7 +67,7 @@ def flooding(
     table = np.concatenate([numbers, values], axis=1)
     known = np.eye(n_agents, dtype=bool)
     new = known
-    opposite = _find_opposite(graph)
+    opposite = find_opposite(graph)
     # Which values have come over which link; the last row stands for no link at all.
     came = np.zeros((graph.senders.size + 1, n_agents), dtype=bool)
     # A value travels over at most A - 1 links, so that the default is never reached.
@@ -77,7 +77,7 @@ def flooding(
         outgoing = new[graph.senders]
         if split_horizon:
             outgoing = outgoing & ~came[opposite]
-        # One transmission for all receivers holds what any of them needs.
+        # One transmission for all receivers holds the values that any of them needs.
         needed = np.zeros_like(known)
         np.logical_or.at(needed, graph.senders, outgoing)
         payloads = [table[rows] if rows.any() else None for rows in outgoing]
@@ -94,7 +94,7 @@ def flooding(
     return np.array(average), known
 
 
-def _find_opposite(graph: Graph) -> Indices:
+def find_opposite(graph: Graph) -> Indices:
     """Return the number of each link's opposite link; that of the last one and 1 if none is."""
     ends = list(zip(graph.receivers.tolist(), graph.senders.tolist(), strict=True))
     numbers = {pair: link for link, pair in enumerate(ends)}

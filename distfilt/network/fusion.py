@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from ..ensembles import match_moments, mean, sample_covariance
 from ..gaussians import intersection_weights
-from ..linalg import cholesky, solve_lower, symmetrise
+from ..linalg import EPS, cholesky, solve_lower, symmetrise
 from ..periods import Periods, wrap_differences
 from ..validation import (
     Array,
@@ -382,15 +383,55 @@ def intersect_ensembles(
     periods = channel.periods
     if scale is not None:
         periods = _scale_periods(periods, scale)
+    is_known = _find_known(means, covs)
+    if not np.count_nonzero(is_known):
+        fuse = partial(_intersect, rule=rule, rounds=rounds, periods=periods)
+        return _move_members(x, (means, covs), channel, fuse) * unit
+    # A constant that all agents know stays, and is not sent.
+    rest = ~is_known
+    if rest.any():
+        belief = means[..., rest], covs[..., rest, :][..., rest]
+        periods = _select_periods(periods, rest)
+        fuse = partial(_intersect, rule=rule, rounds=rounds, periods=periods)
+        x[..., rest] = _move_members(x[..., rest], belief, channel, fuse)
+    return np.asarray(x * unit)
+
+
+def _move_members(
+    x: Array, belief: Pair, channel: Channel, fuse: Callable[[Pair, Channel], Pair]
+) -> Array:
+    """Move ensembles by the affine map from their sample moments to the fused ones."""
     try:
-        fused = _intersect((means, covs), channel, rule, rounds, periods)
-        # The affine map from the sample moments to the fused ones, in the given units
-        # again.
-        return match_moments(x, *fused) * unit
+        return match_moments(x, *fuse(belief, channel))
     except ValueError:
         # Singular if an ensemble has no more members than components.
-        check_positive_definite(covs, "ensembles")
+        check_positive_definite(belief[1], "ensembles")
         raise
+
+
+def _find_known(means: Array, covs: Array) -> Mask:
+    """Return which components are constants that the members of all agents agree on, (d,).
+
+    >>> means = np.ones((2, 2))
+    >>> _find_known(means, np.array([np.diag([1.0, 0.0])] * 2))
+    array([False,  True])
+    >>> _find_known(means + [[0.0], [1.0]], np.zeros((2, 2, 2)))
+    Traceback (most recent call last):
+    ValueError: ensembles must have equal means where no agent has a variance, got means ...
+    """
+    # Members that are all equal vary by rounding alone.
+    rounding = 16 * EPS * np.abs(means)
+    is_known = np.diagonal(covs, axis1=-2, axis2=-1) <= rounding**2
+    by_component = np.asarray(is_known.reshape(-1, means.shape[-1]).all(axis=0))
+    if not np.count_nonzero(by_component):
+        return by_component
+    differs = np.ptp(means, axis=-2) > rounding.max(axis=-2)
+    if (differs & by_component).any():
+        raise ValueError(
+            "ensembles must have equal means where no agent has a variance, got means that "
+            f"differ by up to {np.ptp(means, axis=-2)[..., by_component].max():g}"
+        )
+    return by_component
 
 
 def _scale_periods(periods: Periods, scale: Array) -> Periods:

@@ -62,6 +62,7 @@ def information_consensus(
     # All agents' angles on one branch
     means = fold(means, channel.periods)
     numbers = pack_information(*to_information(means, covs))
+    # The rule is the user's, and mixes vectors of d(d+1)/2 + d numbers.
     averaged = call_user(consensus, numbers, channel)
     averaged = check_array(averaged, "consensus", numbers.shape)
     return from_information(*unpack_information(averaged, means.shape[-1]))
@@ -113,6 +114,7 @@ def diffuse_means(
     """
     if weights is None:
         weights = metropolis(channel.graph)
+    # A combination with a negative weight is not convex.
     least = min(weights.self_weights.min(), weights.link_weights.min(initial=0.0))
     if least < 0:
         raise ValueError(f"weights must be nonnegative, got {least:g}")
@@ -122,6 +124,7 @@ def diffuse_means(
     if not channel.periods:
         means = channel.mix(means, weights, on_loss=on_loss, rounds=rounds)
         return means, covs.copy()
+    # Angles move by weighted differences, the shorter way round.
     for _ in range(rounds):
         means, _ = _mix_circular(means, channel, weights)
     return means, covs.copy()
@@ -135,6 +138,7 @@ def to_information(means: Array, covs: Array) -> tuple[Array, Array]:
 
 def from_information(matrix: Array, vector: Array) -> Pair:
     """Return means and covariances of information matrices and vectors."""
+    # P = Ω⁻¹ and m = P q
     cov = symmetrise(_invert(matrix))
     return (cov @ vector[..., None])[..., 0], cov
 
@@ -152,6 +156,7 @@ def pack_information(matrix: Array, vector: Array) -> Array:
 def unpack_information(numbers: Array, d: int) -> tuple[Array, Array]:
     """Return the matrices and vectors of packed information."""
     rows, columns = np.triu_indices(d)
+    # The same numbers in both triangles
     matrix = np.empty((*numbers.shape[:-1], d, d))
     matrix[..., rows, columns] = numbers[..., : rows.size]
     matrix[..., columns, rows] = numbers[..., : rows.size]

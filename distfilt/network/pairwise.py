@@ -1,4 +1,4 @@
-"""Fusion rules for two Gaussians at a time: an agent fuses what it receives one after the other.
+"""Fusion rules for two Gaussians at a time: an agent fuses the received ones one by one.
 
 The result depends on the order, which is that of the senders.
 """
@@ -156,9 +156,9 @@ def split_covariance_intersection(
         Each agent's mean, (*runs, A, d), and the covariances (*runs, A, d, d) of the part of its
         error that may be correlated with others', and of the part that is independent.
     channel : Channel
-        All three are sent on each link, d + d(d+1) scalars. A lost message is left out. What was
-        sent is no longer independent: before another exchange the caller moves it to the
-        dependent part, and so do further `rounds`.
+        All three are sent on each link, d + d(d+1) scalars. A lost message is left out. Parts
+        that have been sent are no longer independent: before another exchange the caller moves
+        them to the dependent part, and so do further `rounds`.
     rule, rounds
         As for :func:`inverse_covariance_intersection`.
 
@@ -186,6 +186,7 @@ def split_covariance_intersection(
     graph = channel.graph
     means, dependent, independent = belief
     d = means.shape[-1]
+    # All runs in one axis
     shape = (-1, graph.n_agents, d)
     parts = [
         means.reshape(shape),
@@ -194,8 +195,9 @@ def split_covariance_intersection(
     ]
     for number in range(rounds):
         if number:
-            # What has been sent before is no longer independent.
+            # A part that has been sent is no longer independent.
             parts = [parts[0], parts[1] + parts[2], 0 * parts[2]]
+        # A mean, and the upper triangles of two covariances
         arrived = channel._transmit_numbers(d + d * (d + 1))
         parts = _fuse_parts(parts, channel, arrived, rule)
     x, dependent_part, independent_part = parts
@@ -213,14 +215,17 @@ def _fuse_parts(
     graph = channel.graph
     fused = [part.copy() for part in parts]
     for turn in range(int(graph.in_degree.max(initial=0))):
+        # All agents with so many neighbours fuse their next one together.
         agents = np.flatnonzero(graph.in_degree > turn)
         links = graph.links.indptr[agents] + turn
         own = [part[:, agents] for part in fused]
         other = [part[:, graph.senders[links]] for part in parts]
         if channel.periods:
+            # On the receiver's branch of circular components
             other[0] = own[0] + wrap_differences(other[0] - own[0], channel.periods)
         new = intersect_split(*own, *other, rule=rule)
         for part, value in zip(fused, new, strict=True):
+            # Flags (R, agents) with as many axes as the part
             has_arrived = arrived[:, links].reshape(
                 len(part), -1, *[1] * (part.ndim - 2)
             )
@@ -261,6 +266,7 @@ def _fuse_in_turn(received: _Received, pair_rule: PairRule) -> Pair:
         new_mean, new_cov = pair_rule(
             own_mean, own_cov, other_mean, received.covs[:, senders]
         )
+        # A lost message changes nothing.
         arrived = received.arrived[:, links, None]
         means[:, agents] = np.where(arrived, new_mean, own_mean)
         covs[:, agents] = np.where(arrived[..., None], new_cov, own_cov)

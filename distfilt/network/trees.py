@@ -25,7 +25,7 @@ LinkGaussians = tuple[
 def fuse_on_tree(
     belief: Gaussians, common: LinkGaussians, channel: Channel
 ) -> tuple[Pair, Pair]:
-    r"""Fuse each Gaussian with the neighbours', without what both have in common: a channel filter.
+    r"""Fuse each Gaussian with the neighbours' without their common information: a channel filter.
 
     .. math:: \mathbf Y_i^+=\mathbf Y_i+\sum_j(\mathbf Y_j-\mathbf Y_{ij}),\qquad
         \mathbf Y_{ij}^+=\mathbf Y_i+\mathbf Y_j-\mathbf Y_{ij}
@@ -75,11 +75,12 @@ def fuse_on_tree(
     n_links = graph.senders.size
     m = means.reshape(-1, graph.n_agents, d)
     link_mean = common[0].reshape(-1, n_links, d)
+    # Information matrices of agents and links
     y = _invert(covs.reshape(-1, graph.n_agents, d, d))
     link_y = _invert(common[1].reshape(-1, n_links, d, d))
     faulty = not channel.faults.is_perfect
     arrived = channel._transmit_numbers(d + d * (d + 1) // 2, acknowledged=faulty)
-    # Both ends add what the other has sent, or neither does.
+    # Both ends add the other one's information, or neither does.
     is_mutual = (arrived & arrived[:, graph.reverse])[..., None, None]
 
     # Y_i + Σ (Y_j - Y_ij), and the mean about the own one:

@@ -8,11 +8,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 from contextvars import ContextVar
-from dataclasses import fields
+from dataclasses import Field, fields
 from functools import cache, cached_property, partial, wraps
 from inspect import Parameter, get_annotations, signature
 from math import isfinite
-from typing import Any, ClassVar, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast
 
 import numpy as np
 
@@ -295,10 +295,15 @@ class FrozenModel:
     distfilt.validation.InvalidArgumentError: size must be an integer, got 1.5
     """
 
+    if TYPE_CHECKING:
+        # Subclasses are dataclasses.
+        __dataclass_fields__: ClassVar[dict[str, Field[object]]]
+
     is_validated: ClassVar[bool] = False
     """Whether the constructor checked this instance; not if the library constructed it."""
 
     def __post_init__(self) -> None:
+        # Any: mypy does not take a class for hashable, as the cache asks for.
         cls: Any = type(self)
         context = CallContext(dict(vars(self)))
         # Shapes refer to fields by name, as they do to arguments in a call.
@@ -333,7 +338,7 @@ class FrozenModel:
 
 @cache
 def _fields(
-    cls: Any,
+    cls: type[FrozenModel],
 ) -> tuple[tuple[str, ...], tuple[tuple[str, Callable[[], object]], ...]]:
     """Return the names of a dataclass's fields, and the factories of defaults by name.
 
@@ -350,9 +355,10 @@ def _fields(
 
 
 @cache
-def field_constraints(cls: Any) -> dict[str, ArgumentConstraint]:
+def field_constraints(cls: type[FrozenModel]) -> dict[str, ArgumentConstraint]:
     """Return the constraints of a dataclass's fields, inherited ones included, arrays last."""
-    names, _ = _fields(cls)
+    dataclass: Any = cls
+    names, _ = _fields(dataclass)
     constraints: dict[str, ArgumentConstraint] = {}
     # Base classes first, so that a subclass may narrow the annotation of a field.
     for base in reversed(cls.__mro__):

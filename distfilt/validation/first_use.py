@@ -7,10 +7,17 @@ there is one. Which comparisons have been made is recorded here, so that the own
 from __future__ import annotations
 
 import weakref
-
-from .decorators import FrozenModel
+from typing import Protocol
 
 __all__ = ["is_first_use", "mark_checked", "needs_check"]
+
+
+class HasValidation(Protocol):
+    """An object that knows whether its constructor checked it, such as a frozen dataclass."""
+
+    @property
+    def is_validated(self) -> bool: ...
+
 
 # Names of the checks that have been made, by the owner's id, as long as the owner lives.
 _CHECKED: dict[int, set[str]] = {}
@@ -50,7 +57,7 @@ def mark_checked(owner: object, check: str) -> None:
     _CHECKED[key].add(check)
 
 
-def is_first_use(owner: FrozenModel, function: str) -> bool:
+def is_first_use(owner: HasValidation, function: str) -> bool:
     """Whether one of an owner's functions is used for the first time; true once.
 
     Never of an owner that the library constructed without validation: its functions are trusted.

@@ -22,6 +22,8 @@ NETWORKS = {
     "ring": graphs.ring(6),
     "star": graphs.star(6),
     "grid": graphs.grid(2, 3),
+    # Neighbours that are equally far from others, as on no graph above.
+    "kite": Graph.from_edges(6, [(0, 1), (1, 2), (2, 0), (2, 3), (3, 4), (4, 5)]),
 }
 each_network = pytest.mark.parametrize("graph", NETWORKS.values(), ids=NETWORKS.keys())
 
@@ -89,6 +91,21 @@ def test_a_ring_costs_half_of_an_echo(agents: int) -> None:
     assert (ledger.scalars == 2 * (agents + agents % 2)).all()
     # By broadcast each observation is sent once, unless all neighbours have it.
     assert (ledger.broadcast_scalars == 2 * (agents - 1 + agents % 2)).all()
+
+
+@each_network
+def test_each_agent_forwards_an_observation_once(graph: Graph) -> None:
+    """To all neighbours but those that are one link nearer to the agent that made it."""
+    f = GaussianFilter(still_model(1), [component([0], std=1.0)] * 6, graph, hops="all")
+    ledger = f.step(f.start(([0.0], [[1.0]])), 0.0, [[1.0]] * 6).ledger
+    for agent in range(6):
+        count = 0
+        for maker in range(6):
+            hops = graph.hops(maker)
+            near = graph.neighbours(agent)
+            count += sum(hops[j] >= hops[agent] for j in near)
+        # The value, and the number of its maker
+        assert ledger.scalars[agent] == 2 * count
 
 
 @pytest.mark.parametrize("graph", [NETWORKS["path"], NETWORKS["star"]])

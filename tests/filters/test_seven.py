@@ -1,4 +1,4 @@
-"""The contract of all seven families, through one list: runs, events, gates, contacts, scores."""
+"""The contract of all families, through one list: runs, events, gates, contacts, scores."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from distfilt.network import (
     Channel,
     Faults,
     Graph,
+    average_consensus,
     covariance_intersection,
     graphs,
     mean_pull,
@@ -41,7 +42,7 @@ QUIET = LinearModel.from_transition(2, model().transition_matrix, lambda t, dt: 
 SWARM = rotating_swarm("gibbs")
 PLACES = default_rng(1).random((9, 2))
 LAW = FokkerPlanck(SWARM, Grid((9, 9)))
-SIX = {
+WITH_SENSORS = {
     "ensemble": partial(filters.EnsembleFilter.exact, members=30, fusion=None),
     "gaussian": filters.GaussianFilter,
     "particle": partial(filters.ParticleFilter, members=300),
@@ -50,9 +51,19 @@ SIX = {
         filters.MixtureFilter, target_dim=2, fusion=partial(target_fusion, target_dim=2)
     ),
     "news": partial(filters.InformationIncrementFilter, target_dim=2),
+    "consensus": partial(
+        filters.InformationConsensusFilter, fusion=average_consensus, average="hybrid"
+    ),
+    "sum": filters.GaussianSumFilter,
+    "likelihood": partial(
+        filters.LikelihoodConsensusFilter,
+        members=300,
+        basis=filters.PolynomialBasis([0, 1]),
+        fusion=average_consensus,
+    ),
 }
-EACH = pytest.mark.parametrize("family", [*SIX, "density"])
-OF_SIX = pytest.mark.parametrize("family", SIX)
+EACH = pytest.mark.parametrize("family", [*WITH_SENSORS, "density"])
+EACH_WITH_SENSORS = pytest.mark.parametrize("family", WITH_SENSORS)
 
 
 def make_filter(
@@ -70,7 +81,7 @@ def make_filter(
     arguments = {"graph": NET, "sensors": EYES} | options
     sensors = arguments.pop("sensors")
     truth, seen = data(sensors)
-    f = SIX[family](model(), sensors, arguments.pop("graph"), **arguments)
+    f = WITH_SENSORS[family](model(), sensors, arguments.pop("graph"), **arguments)
     n = len(times)
     seen = [None if s is None else s[:n] for s in seen]
     start = f.start(PRIOR, rng=default_rng(0))
@@ -119,7 +130,7 @@ def test_a_run_is_its_steps_whether_saved_or_not(family: str, tmp_path: Path) ->
     assert f"t={times[-1]:g}" in repr(state)
 
 
-@OF_SIX
+@EACH_WITH_SENSORS
 def test_events_of_any_order_are_the_series(family: str) -> None:
     f, start, seen, _ = make_filter(family)
     events = []
@@ -160,7 +171,7 @@ def test_particles_that_hear_all_are_the_joint_filter(options: Any) -> None:
         assert covariance_error.max() < 0.3
 
 
-@OF_SIX
+@EACH_WITH_SENSORS
 def test_units_change_nothing(family: str) -> None:
     """A state in millimetres in place of metres, to the rounding of a long product."""
     big = 1e3
@@ -175,7 +186,7 @@ def test_units_change_nothing(family: str) -> None:
         return [first, second, third]
 
     f, start, seen, _ = make_filter(family, sensors=sensors_in(1.0))
-    g = SIX[family](wide, sensors_in(big), NET)
+    g = WITH_SENSORS[family](wide, sensors_in(big), NET)
     mean, cov = PRIOR
     first = (big * mean, big**2 * cov)
     a = f.run(start, TIMES, seen)
@@ -195,7 +206,7 @@ def test_the_order_of_agents_changes_nothing(family: str) -> None:
         begin = f.start(PLACES[order])
     else:
         sensors = [EYES[k] for k in order]
-        g = SIX[family](model(), sensors, NET)
+        g = WITH_SENSORS[family](model(), sensors, NET)
         begin = g.start(PRIOR)
     a = f.run(start, TIMES, seen)
     seen_in_order = [seen[k] for k in order]
@@ -206,7 +217,7 @@ def test_the_order_of_agents_changes_nothing(family: str) -> None:
         assert np.allclose(expected, b[name].values, atol=1e-10)
 
 
-@pytest.mark.parametrize("family", SIX)
+@pytest.mark.parametrize("family", WITH_SENSORS)
 def test_the_gate_lets_pass_what_its_share_says(family: str) -> None:
     """Just inside the quantile a reading counts, just outside it is left out and counted."""
     sensors = [component([0, 1], std=0.6), None, None]
@@ -285,7 +296,7 @@ def test_nothing_is_lost_until_the_next_contact(family: str, t0: float) -> None:
     """After it all agents have the belief of one filter of all observations; before, their own."""
     # Without process noise an exchange of increments is exact as well.
     lag = {"lag": 8} if family == "gaussian" else {}
-    f = SIX[family](QUIET, EYES, NET, exchange_interval=0.2, **lag)
+    f = WITH_SENSORS[family](QUIET, EYES, NET, exchange_interval=0.2, **lag)
     g = filters.GaussianFilter(QUIET, EYES, NET)
     private = filters.GaussianFilter(QUIET, EYES, NET, share_observations=False)
     _, seen = data(EYES)

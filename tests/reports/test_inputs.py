@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from distfilt import filters
+from distfilt.kalman import filterpy_ekf, filterpy_ukf
 from distfilt.models import InputModel, Inputs
 from distfilt.sensors import component
 from distfilt.updates.gaussian import exact_forecast
@@ -105,6 +106,24 @@ def test_all_agents_of_a_transport_filter_draw_the_same() -> None:
     )
     state = f.step(f.start(PRIOR, rng=np.random.default_rng(0)), 1.0, [None, None])
     assert (state.belief[0] == state.belief[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("reference", "linearization"),
+    [(filterpy_ekf, "extended"), (filterpy_ukf, "unscented")],
+)
+def test_filters_of_filterpy_have_the_inputs_noise(
+    reference: Any, linearization: Any
+) -> None:
+    """The same as the library's, whose noise is compared with G Σ Gᵀ by hand above."""
+    sensor = component([0, 1], std=0.2)
+    seen = np.array([[0.6, 0.5], [2.1, 1.6]])
+    prior = (PRIOR[0], PRIOR[1] + 0.01 * np.eye(3))
+    run = reference(*prior, seen, model=ROBOT, sensors=[sensor], times=[1.0, 2.0])
+    f = filters.GaussianFilter(ROBOT, [sensor], linearization=linearization)
+    expected = f.run(f.start(prior), [1.0, 2.0], [seen])
+    assert np.allclose(run.means, expected["mean"].values[:, 0], atol=1e-9)
+    assert np.allclose(run.covariances, expected["covariance"].values[:, 0], atol=1e-9)
 
 
 def test_further_noise_is_added() -> None:

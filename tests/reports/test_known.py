@@ -5,6 +5,7 @@
 | own | a calibrated bias in the state with variance zero, unscented | equals the state without |
 | own | the same in `kalman_filter` and its smoother | equals the state without it |
 | own | agents that share such a constant, by every rule of fusion | equals the state without it |
+| own | ensembles that share it, by intersection | equals the ensembles without it |
 
 A bias b that is known to be 0.5 adds to the observation; without it 0.5 is subtracted beforehand.
 """
@@ -40,6 +41,15 @@ SHORT = Model(2, bend, lambda t, dt: Q)
 LONG = Model(3, bend, lambda t, dt: np.pad(Q, ((0, 1), (0, 1))))
 SQUARE = Sensor(1, lambda x: x[..., :1] ** 2, [[0.4]])
 BIASED = Sensor(1, lambda x: x[..., :1] ** 2 + x[..., 2:], [[0.4]])
+LONG_WALK = LinearModel.from_transition(
+    3, lambda dt: np.eye(3), lambda t, dt: np.pad(Q, ((0, 1), (0, 1)))
+)
+LINEAR_BIASED = Sensor(
+    1,
+    lambda x: x[..., :1] + x[..., 2:],
+    [[0.4]],
+    linear=lambda d: np.array([[1.0, 0.0, 1.0]]),
+)
 
 
 @pytest.mark.parametrize("linearization", ["extended", "unscented"])
@@ -165,5 +175,48 @@ def test_networks_of_filters_fuse_beside_a_constant(linearization: Any) -> None:
 )
 def test_mixtures_refuse_it_by_name(make: Any) -> None:
     f = make(LONG, [BIASED], target_dim=2)
-    with pytest.raises(ValueError, match="prior must be a positive definite matrix"):
+    with pytest.raises(ValueError, match="variance 0 of component 2: give a known"):
         f.start(WITH_BIAS)
+
+
+@pytest.mark.parametrize("scale", [None, [2.0, 3.0, 0.1]])
+@pytest.mark.parametrize("rule", ["equal", "min_determinant"])
+def test_ensembles_are_intersected_beside_a_constant(rule: Any, scale: Any) -> None:
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((2, 4, 9, 2)) + rng.standard_normal((2, 4, 1, 2))
+    long = np.insert(x, 1, 0.1, axis=-1)
+    options: dict[str, Any] = {"rule": rule, "rounds": 2}
+    short_scale = None if scale is None else [scale[0], scale[2]]
+    channel = Channel(graphs.ring(4), runs=(2,))
+    short = Channel(graphs.ring(4), runs=(2,))
+    a = network.intersect_ensembles(long, channel, scale=scale, **options)
+    b = network.intersect_ensembles(x, short, scale=short_scale, **options)
+    assert np.allclose(a[..., [0, 2]], b, atol=1e-12)
+    assert np.allclose(a[..., 1], 0.1, rtol=1e-15)
+    # The constant is not sent.
+    assert (channel.ledger.scalars == short.ledger.scalars).all()
+    # Agents that know it differently, and an ensemble that is constant at one agent alone
+    long[:, 1, :, 1] = 0.2
+    with pytest.raises(ValueError, match="equal means where no agent has a variance"):
+        network.intersect_ensembles(long, channel)
+    long[:, 1:, :, 1] = x[:, 1:, :, 0] ** 2
+    with pytest.raises(ValueError, match="ensembles must be a positive definite"):
+        network.intersect_ensembles(long, channel)
+
+
+def test_networks_of_exact_ensembles_know_a_constant() -> None:
+    make = partial(filters.EnsembleFilter.exact, graph=graphs.path(2), members=40)
+    f = make(LONG_WALK, [LINEAR_BIASED] * 2)
+    state = f.start(WITH_BIAS, rng=np.random.default_rng(0))
+    run = f.run(state, TIMES, [SEEN + BIAS] * 2)
+    # The Gaussian filter by the same rule has the same covariances, whatever the means are.
+    fusion = partial(network.covariance_intersection, rule="min_determinant")
+    g = filters.GaussianFilter(
+        LONG_WALK, [LINEAR_BIASED] * 2, graphs.path(2), fusion=fusion
+    )
+    sample_cov = np.cov(state.ensembles[0].T)
+    prior = [(e.mean(axis=0), np.cov(e.T)) for e in state.ensembles]
+    assert np.allclose(sample_cov[2], 0.0, atol=1e-28)
+    expected = g.run(g.start(prior), TIMES, [SEEN + BIAS] * 2)
+    assert np.allclose(run["mean"].values, expected["mean"].values, atol=1e-8)
+    assert np.allclose(run["variance"].values, expected["variance"].values, atol=1e-8)
