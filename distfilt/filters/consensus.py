@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -49,7 +49,8 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
     ----------
     model, sensors, graph, gate_probability, faults, names
         As for :class:`~distfilt.filters.SensorFilter`. Where nobody can send, each agent uses its
-        own observations only.
+        own observations only. Known constants, components without variance, have no information
+        matrix: they need "measurements".
     fusion : callable
         The consensus rule, ``fusion(values, channel) -> values`` for vectors, such as
         ``partial(average_consensus, rounds=5)`` or ``finite_time_consensus``; required.
@@ -136,7 +137,7 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
     ) -> Array:
         """Return the packed information of forecasts and observations after the consensus."""
 
-        def compute(m: Array, p: Array, *_: Any) -> tuple[Array]:
+        def compute(m: Array, p: Array, *_: object) -> tuple[Array]:
             return (pack_information(*to_information(m, p)),)
 
         agents = range(self.n_agents)
@@ -156,7 +157,7 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
         """Return the Gaussians that have this information."""
         d = means.shape[-1]
 
-        def compute(numbers: Array, *_: Any) -> tuple[Array, Array]:
+        def compute(numbers: Array, *_: object) -> tuple[Array, Array]:
             return from_information(*unpack_information(numbers, d))
 
         return step.apply(compute, (total,), (means, covs), range(self.n_agents))
@@ -167,7 +168,7 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
         """Return the Gaussians with information added; components may be known constants."""
         d = means.shape[-1]
 
-        def compute(m: Array, p: Array, numbers: Array, *_: Any) -> tuple[Array, Array]:
+        def compute(m: Array, p: Array, numbers: Array, *_: object) -> tuple[Array, Array]:
             j, v = unpack_information(numbers, d)
             # P⁺ = (I + P J)⁻¹ P and m⁺ = m + P⁺ (v - J m)
             new = symmetrise(np.asarray(np.linalg.solve(np.eye(d) + p @ j, p)))

@@ -32,10 +32,10 @@ from ..validation import (
     NonNegativeFloat,
     PositiveFloat,
     PositiveInt,
+    Rng,
     call_user,
     check_array,
     format_number,
-    Rng,
 )
 from .observations import list_by_agent
 from .options import ExchangesAtIntervals

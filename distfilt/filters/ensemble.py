@@ -252,7 +252,7 @@ class EnsembleFilter(
         model, sensors, graph
             As for the class.
         **options
-            Any other option of the class; needs more `members` than d + twice the number of
+            Other options of the class; needs more `members` than d + twice the number of
             received values.
 
         Examples

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 
 from ..density import Grid
 from ..linalg import cholesky, log_sum_exp, solve_lower
 from ..updates import particles
-from ..validation import Array, all_finite
+from ..validation import Array, Rng, all_finite
 from .base import SensorFilter
 from .options import FusesBeliefs, IsolatesRuns, ScoresObservations, SharesObservations
 from .particle import compute_moments
 from .priors import Prior, prior_mixtures
 from .record import Summary
-from .states import SensorState
+from .states import SensorState, State
 from .step import Received, Step
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ class GridFilter(
     grid: Grid
     fused: Literal["beliefs", "likelihoods"] = "beliefs"
 
-    state_class: ClassVar[type[Any]] = GridState
+    state_class: ClassVar[type[State]] = GridState
     batched_summary: ClassVar[bool] = True
     supports_likelihoods: ClassVar[bool] = True
     belief_kind: ClassVar[str | None] = "vectors"
@@ -153,8 +153,8 @@ class GridFilter(
             )
 
     def initial_state(
-        self, prior: Prior, runs: tuple[int, ...], rng: Any
-    ) -> dict[str, Any]:
+        self, prior: Prior, runs: tuple[int, ...], rng: Rng | None
+    ) -> dict[str, object]:
         """Return the prior's density at the centres, times the cells' volume."""
         centres = self.grid.centres
         # A distribution of scipy has a density; any other prior is a mixture or a Gaussian.
@@ -275,7 +275,7 @@ def _normalize(logs: Array) -> Array:
     return np.maximum(logs - log_sum_exp(logs), _LEAST)
 
 
-def _normalize_joint(joint: Array, *_: Any) -> tuple[Array, Array]:
+def _normalize_joint(joint: Array, *_: object) -> tuple[Array, Array]:
     """Return normalised logarithms, and those of the sums."""
     total = log_sum_exp(joint)
     if not (total > -1e300).all():

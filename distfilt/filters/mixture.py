@@ -296,7 +296,8 @@ class MixtureFilter(TargetMixtureFilter, FusesBeliefs[MixtureState]):
     of them, conditions them on its observation, sends its target marginal, fuses the marginals it
     receives, and merges down to `n_components`. A component that cannot predict an observation (the
     sensor gives NaN for one of its points) contradicts it and is left out; an observation that
-    contradicts all components raises an error.
+    contradicts all components raises an error. Agents that share their observations instead of
+    fusing beliefs, all runs at once: :class:`GaussianSumFilter`.
 
     Parameters
     ----------
@@ -393,6 +394,7 @@ class MixtureFilter(TargetMixtureFilter, FusesBeliefs[MixtureState]):
             pairs = zip(settled, common, strict=True)
             beliefs = [align_mixture(b, mean, self.periods) for b, mean in pairs]
         fused = list(call_user(rule, beliefs, step.channel))
+        checked: list[GaussianMixture] = []
         for agent, (new, old) in enumerate(zip(fused, beliefs, strict=True)):
             if not isinstance(new, GaussianMixture):
                 raise InvalidArgumentError(
@@ -406,4 +408,5 @@ class MixtureFilter(TargetMixtureFilter, FusesBeliefs[MixtureState]):
             with step.failing_as(agent):
                 # Raises a LinAlgError if the fusion has made a covariance singular.
                 new.factors  # noqa: B018
-        return fused
+            checked.append(new)
+        return checked

@@ -179,7 +179,7 @@ def record_run(
     axes = {"covariance": (*lead, "component", "column")}
     for name in ("mean", "variance", "squared_error", "crps"):
         axes[name] = (*lead, "component")
-    variables: dict[str, Any] = {}
+    variables: dict[str, object] = {}
     for name, values in series.items():
         meaning, unit = _MEANING.get(name, (name.replace("_", " "), "1"))
         attributes = {"long_name": meaning, "units": unit}
@@ -227,7 +227,7 @@ def _collect_series(
                 numbers = [getattr(state, name) for state in states]
                 row[name] = np.array(numbers[0] if is_single else numbers)
         if isinstance(last, SensorState):
-            unseen = _read_unseen(cast(Any, states), f.n_agents)
+            unseen = _read_unseen(cast(Sequence[SensorState], states), f.n_agents)
             row["unseen"] = unseen[0] if is_single else unseen
         if known is not None:
             index = first if is_single else slice(first, first + len(block))
@@ -457,7 +457,7 @@ def final_state(run: xarray.Dataset) -> State:
     )
 
 
-def _count_messages(name: str, ledgers: list[Ledger]) -> dict[str, Any]:
+def _count_messages(name: str, ledgers: list[Ledger]) -> dict[str, object]:
     """Return one field of the ledgers as variables: in each step, and up to then."""
     # The first ledger is that of the state before the run.
     total = np.array([getattr(ledger, name) for ledger in ledgers])

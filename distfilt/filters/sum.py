@@ -12,14 +12,14 @@ import numpy as np
 from ..gaussians.single import condition
 from ..linalg import cholesky, log_det, log_sum_exp, quadratic_form, symmetrise
 from ..periods import settle
-from ..validation import Array
+from ..validation import Array, Rng
 from .base import SensorFilter
 from .gaussian import GaussianFamily, GaussianState
 from .options import SharesObservations
 from .priors import Prior, prior_mixtures
 from .record import Summary
 from .resets import Reset
-from .states import SensorState
+from .states import SensorState, State
 from .step import Received, Step
 
 __all__ = ["GaussianSumFilter", "GaussianSumState"]
@@ -130,11 +130,11 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
     0.4
     """
 
-    state_class: ClassVar[type[Any]] = GaussianSumState
+    state_class: ClassVar[type[State]] = GaussianSumState
 
     def initial_state(
-        self, prior: Prior, runs: tuple[int, ...], rng: Any
-    ) -> dict[str, Any]:
+        self, prior: Prior, runs: tuple[int, ...], rng: Rng | None
+    ) -> dict[str, object]:
         """Return the components of the prior, the same for all runs."""
         mixtures = prior_mixtures(prior, self.model.dim, self.n_agents)
         counts = {mixture.n_components for mixture in mixtures}
@@ -290,7 +290,7 @@ def _condition_bank(
     innovation: Array,
     slope: Array,
     noise: Array,
-    *_: Any,
+    *_: object,
 ) -> tuple[Array, ...]:
     """Condition components (..., L, d), and return normalised log-weights and log p(y) too."""
     missing = np.asarray(np.isnan(innovation))

@@ -9,10 +9,11 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 
 from ..network import Graph, fuse_on_tree
-from ..validation import Array, check_positive_definite
+from ..validation import Array, Rng, check_positive_definite
 from .gaussian import GaussianFamily, GaussianState
 from .priors import Prior
 from .resets import Reset, reset_gaussian
+from .states import State
 from .step import Step
 
 __all__ = ["ChannelFilter", "ChannelFilterState"]
@@ -85,7 +86,7 @@ class ChannelFilter(GaussianFamily):
     (array([3., 3., 3.]), array([4, 8, 4]))
     """
 
-    state_class: ClassVar[type[Any]] = ChannelFilterState
+    state_class: ClassVar[type[State]] = ChannelFilterState
 
     def check_parts(self) -> None:
         """Refuse a graph that changes."""
@@ -97,8 +98,8 @@ class ChannelFilter(GaussianFamily):
             )
 
     def initial_state(
-        self, prior: Prior, runs: tuple[int, ...], rng: Any
-    ) -> dict[str, Any]:
+        self, prior: Prior, runs: tuple[int, ...], rng: Rng | None
+    ) -> dict[str, object]:
         """Return the prior for the agents, and for the links as their common belief."""
         fields = super().initial_state(prior, runs, rng)
         means = np.asarray(fields["joint_means"])
@@ -115,7 +116,7 @@ class ChannelFilter(GaussianFamily):
         fields["link_covariances"] = np.repeat(covs[..., :1, :, :], n_links, axis=-3)
         return fields
 
-    def reset_belief(self, state: GaussianState, reset: Reset) -> Any:
+    def reset_belief(self, state: GaussianState, reset: Reset) -> GaussianState:
         """Return the state with a new belief about some components, which all agents learn."""
         if len(reset.agents) != self.n_agents:
             raise ValueError(

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Protocol
 
 import numpy as np
 
@@ -47,7 +47,30 @@ __all__ = ["filterpy_ekf", "filterpy_kf", "filterpy_ukf"]
 
 StateMean = Annotated[ArrayInput, "... model.dim"]
 StateCov = Annotated[PositiveDefinite, "... model.dim model.dim"]
-Step = Callable[[Any, int, Array, Mask], None]
+
+
+class _SigmaPoints(Protocol):
+    """What draws the points of an unscented filter of filterpy."""
+
+    def sigma_points(self, x: Array, P: Array) -> Array: ...
+
+
+class _Filterpy(Protocol):
+    """What is used of the filters of filterpy, the points of the unscented one alone."""
+
+    x: Array
+    P: Array
+    F: Array
+    Q: Array
+    sigmas_f: Array
+    Wm: Array
+    points_fn: _SigmaPoints
+    log_likelihood: float
+    predict: Callable[..., None]
+    update: Callable[..., None]
+
+
+Step = Callable[[_Filterpy, int, Array, Mask], None]
 """``step(kf, k, observation, present)`` moves a filter of filterpy to step k."""
 
 
@@ -80,7 +103,7 @@ def filterpy_kf(
     f, h, q, r = repeat_per_step(len(observations), F=F, H=H, Q=Q, R=R)
     m, d = h.shape[1:]
 
-    def step(kf: Any, k: int, z: Array, present: Mask) -> None:
+    def step(kf: _Filterpy, k: int, z: Array, present: Mask) -> None:
         kf.predict(F=f[k], Q=q[k])
         if present.any():
             # Rows of missing components are deleted from H and R.
@@ -127,7 +150,7 @@ def filterpy_ekf(
     """
     sensor, clock = _stack_sensors(sensors, times, observations)
 
-    def step(kf: Any, k: int, z: Array, present: Mask) -> None:
+    def step(kf: _Filterpy, k: int, z: Array, present: Mask) -> None:
         t = float(clock[k])
         dt = float(clock[k + 1] - clock[k])
         # The linearisation is about the last analysis mean.
@@ -187,14 +210,15 @@ def filterpy_ukf(
     sensor, clock = _stack_sensors(sensors, times, observations)
     filterpy = import_optional("filterpy.kalman", "reference")
 
-    def make() -> Any:
+    def make() -> _Filterpy:
         # α = 1, β = 0, κ = 1: the weights of all points are positive.
         points = filterpy.MerweScaledSigmaPoints(model.dim, 1.0, 0.0, 1.0)
-        return filterpy.UnscentedKalmanFilter(
+        kf: _Filterpy = filterpy.UnscentedKalmanFilter(
             model.dim, sensor.dim, 0.0, None, None, points
         )
+        return kf
 
-    def step(kf: Any, k: int, z: Array, present: Mask) -> None:
+    def step(kf: _Filterpy, k: int, z: Array, present: Mask) -> None:
         t = float(clock[k])
         dt = float(clock[k + 1] - clock[k])
         kf.Q = model.noise_at(kf.x, t, dt)
@@ -244,7 +268,7 @@ def _run_filterpy(
     mean: Array,
     cov: Array,
     observations: Array,
-    make: Callable[[], Any],
+    make: Callable[[], _Filterpy],
     step: Step,
 ) -> FilterResult:
     """Filter every run by a filter of filterpy of its own, step after step."""

@@ -151,10 +151,11 @@ class Channel:
             self.faults.check_graph(self.graph)
 
     @classmethod
-    def construct(cls, *args: Any, **options: Any) -> Channel:
+    def construct(cls, *args: object, **options: object) -> Channel:
         """Build a channel without checks, from a graph and a ledger that the library made."""
+        make = cast(Callable[..., Channel], cls)
         with skip_validation():
-            return cls(*args, **options)
+            return make(*args, **options)
 
     def for_run(self, run: Indices, ledger: Ledger) -> Channel:
         """Return a copy with another ledger, for all runs of an array or for a single one.
@@ -541,7 +542,7 @@ class Channel:
         graph = self.graph
         # Rounds that are entered later only add to it.
         ledger = self._ledger
-        totals: dict[str, Any] = {}
+        totals: dict[str, object] = {}
         # Without links there is no round.
         if graph.senders.size:
             totals["rounds"] = ledger.rounds + repeated * len(used_by_round)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,12 @@ from ..validation import (
     check_array,
 )
 from .graphs import Graph
+
+if TYPE_CHECKING:
+    Windows = Sequence[Sequence[float]] | Array
+else:
+    # Checked by `_check_windows`, which converts it.
+    Windows = object
 
 __all__ = ["Faults"]
 
@@ -98,7 +104,7 @@ class Faults(FrozenModel):
     burst_length: Annotated[float, Bounds(at_least=1)] | None = None
     delay: NonNegativeInt = 0
     silent: Collection[NonNegativeInt] = ()
-    during: Any = None
+    during: Windows | None = None
     others: tuple[Faults, ...] = ()
 
     def __post_init__(self) -> None:

@@ -29,9 +29,10 @@ __all__ = ["LikelihoodSensor"]
 class LikelihoodSensor(Sensor):
     """A sensor whose observation has any density p(y | x), for filters of weighted members.
 
-    :class:`~distfilt.filters.ParticleFilter` and :class:`~distfilt.filters.TransportFilter` weigh
-    their members by it, with their threshold, jitter, rejuvenation and lag. The other families take
-    the noise as Gaussian and refuse it.
+    :class:`~distfilt.filters.ParticleFilter`, :class:`~distfilt.filters.TransportFilter` and
+    :class:`~distfilt.filters.LikelihoodConsensusFilter` weigh their members by it, with their
+    threshold, jitter, rejuvenation and lag, and :class:`~distfilt.filters.GridFilter` its cells.
+    The other families take the noise as Gaussian and refuse it.
 
     Parameters
     ----------
@@ -186,7 +187,7 @@ class LikelihoodSensor(Sensor):
         if is_missing.all():
             return np.zeros(lead)
         if is_missing.any():
-            # Any observation stands in where there is none; its value is not used.
+            # Some observation stands in where there is none; its value is not used.
             observed = np.where(
                 is_missing[..., None], observed[~is_missing][0], observed
             )

@@ -15,7 +15,7 @@ import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
-from typing import Annotated, Any, Literal, Protocol, runtime_checkable
+from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -50,7 +50,7 @@ _ROUNDING = 1e-13
 class ConditionalMap(Protocol):
     """A map z = S(y, x) with its inverse in x and the derivative's log-determinant.
 
-    Any object with these three methods is one:
+    An object with these three methods is one:
 
     >>> class Shift:
     ...     def __call__(self, y, x):
@@ -424,7 +424,7 @@ def _solve_component(design: Array, solver: str) -> Array:
     cp = import_optional("cvxpy", "maps")
     n = design.shape[-1]
     problem, root, coefficients = _compile_program(n)
-    root.value = np.linalg.qr(design, mode="r")
+    root.value = np.asarray(np.linalg.qr(design, mode="r"))
     try:
         problem.solve(solver=solver, warm_start=False)
         status = problem.status
@@ -437,8 +437,23 @@ def _solve_component(design: Array, solver: str) -> Array:
     return np.asarray(coefficients.value)
 
 
+class _Symbol(Protocol):
+    """What is used of a parameter or a variable of cvxpy."""
+
+    value: Array | None
+
+
+class _Program(Protocol):
+    """What is used of a problem of cvxpy."""
+
+    @property
+    def status(self) -> str: ...
+
+    def solve(self, *, solver: str, warm_start: bool) -> float: ...
+
+
 @lru_cache(maxsize=32)
-def _compile_program(n: int) -> tuple[Any, Any, Any]:
+def _compile_program(n: int) -> tuple[_Program, _Symbol, _Symbol]:
     """Return the program (12) of n coefficients, its parameter and its variable.
 
     The samples enter by |u_0 + Z u|² only, which their QR factor keeps: the factor is the

@@ -72,7 +72,7 @@ def transport_map_update(
         ``fit(y, x) -> map``: an estimator of the map, such as
         :func:`distfilt.triangular.separable.fit` with its options.
     noise_factor : float
-        Factor of the drawn noise. Any value but one is a mistake; chapter 4 shows the effect of
+        Factor of the drawn noise. All but one are mistakes; chapter 4 shows the effect of
         zero and of a hundredth.
 
     Examples

@@ -80,7 +80,7 @@ def with_inflation(
     Parameters
     ----------
     update : callable
-        Any update.
+        An update.
     factor : float
         Factor of the analysis standard deviations in each update, at least 0.5.
 
@@ -122,7 +122,7 @@ def with_projection(
     Parameters
     ----------
     update : callable
-        Any update.
+        An update.
     constraint, variant, regularisation
         As for :func:`distfilt.coupling.project`.
 
@@ -165,7 +165,7 @@ def with_retraction(
     Parameters
     ----------
     update : callable
-        Any update.
+        An update.
     constraint, motion
         As for :func:`distfilt.coupling.retract`; with `motion` the velocities become tangent.
 
@@ -203,7 +203,7 @@ def with_augmentation(
     Parameters
     ----------
     update : callable
-        Any update.
+        An update.
     constraint : Constraint
         :math:`\mathbf g(\mathbf x)=\mathbf d`.
     std : float
@@ -270,7 +270,7 @@ def serially(update: Update) -> Update:
     Parameters
     ----------
     update : callable
-        Any update. It never gets more observations at once than the largest group has, so an
+        An update. It never gets more observations at once than the largest group has, so an
         agent that receives more observations than it has members can still use
         :func:`~distfilt.updates.enkf_sampled_covariance`.
 

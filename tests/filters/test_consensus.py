@@ -71,6 +71,7 @@ def test_exact_averages_give_the_filter_of_all_observations(
     _, seen = data(observing())
     expected, _ = kalman(seen, observing())
     f = consensus_filter(finite_time_consensus, average=average, graph=graph)
+    # The Kalman filter of all agents' observations, step by step
     states = list(f.steps(f.start(PRIOR), TIMES, seen))
     for k, state in enumerate(states):
         assert np.allclose(state.means, expected.means[k], rtol=0, atol=1e-9)
@@ -86,6 +87,7 @@ def test_more_rounds_come_closer_to_it(average: str) -> None:
         rule = partial(average_consensus, rounds=rounds)
         state = last_of(consensus_filter(rule, average=average), seen)
         errors.append(np.abs(state.means - expected.means[-1]).max())
+    # Smaller from each number of rounds to the next
     assert errors == sorted(errors, reverse=True)
     assert errors[0] > 1e-2
     assert errors[-1] < 1e-9
@@ -127,6 +129,7 @@ def test_weighted_is_hybrid_with_the_number_of_agents_for_half_the_numbers(
     rule = partial(average_consensus, rounds=rounds)
     weighted = last_of(consensus_filter(rule), seen)
     hybrid = last_of(consensus_filter(rule, average="hybrid"), seen)
+    # A ⟨Ω / A + δΩ⟩ = ⟨Ω⟩ + A ⟨δΩ⟩
     assert np.allclose(weighted.means, hybrid.means, rtol=0, atol=1e-12)
     assert np.allclose(weighted.covariances, hybrid.covariances, atol=1e-12)
     assert (hybrid.ledger.scalars == 2 * weighted.ledger.scalars).all()
@@ -159,6 +162,7 @@ def test_consensus_on_information_is_intersection_by_the_weights_of_all_rounds()
     m, p = gaussians(1, 6, d=3)
     rule = partial(average_consensus, rounds=4)
     means, covs = information_consensus((m, p), Channel(NET), consensus=rule)
+    # Four rounds of mixing are one by the fourth power.
     w = np.linalg.matrix_power(weights.metropolis(NET).matrix.toarray(), 4)
     information = np.linalg.inv(p)
     expected = np.linalg.inv(np.einsum("ij,jkl->ikl", w, information))
@@ -175,6 +179,7 @@ def test_consensus_on_information_is_consistent_for_any_correlation() -> None:
     w = np.linalg.matrix_power(weights.metropolis(NET).matrix.toarray(), 2)
     broken = 0
     for seed in range(50):
+        # Errors of all agents with a random joint covariance
         root = rng(seed).standard_normal((d * agents, 4))
         joint = root @ root.T + 0.1 * np.eye(d * agents)
         blocks = joint.reshape(agents, d, agents, d)
@@ -188,6 +193,7 @@ def test_consensus_on_information_is_consistent_for_any_correlation() -> None:
             gains = np.array(
                 [covs[i] @ information[j] * w[i, j] for j in range(agents)]
             )
+            # Σ_jk K_j C_jk K_kᵀ
             error = np.einsum("iab,ibjc,jdc->ad", gains, blocks, gains)
             assert np.linalg.eigvalsh(covs[i] - error)[0] > -1e-9 * np.trace(error)
             # Control: the product of the neighbours' densities is not.
@@ -222,6 +228,7 @@ def test_the_diffusion_kalman_filter_by_its_algorithm(rounds: int) -> None:
         p = move @ p @ move.T + dt * Q
         psi = np.empty_like(x)
         for agent in range(6):
+            # The incremental update: own and neighbours' observations, in information form
             information = np.linalg.inv(p[agent])
             total = information.copy()
             vector = np.zeros(2)
@@ -233,6 +240,7 @@ def test_the_diffusion_kalman_filter_by_its_algorithm(rounds: int) -> None:
                 vector += gain @ (seen[j][k] - h @ x[agent])
             p[agent] = np.linalg.inv(total)
             psi[agent] = x[agent] + p[agent] @ vector
+        # The diffusion update
         x = c @ psi
         assert np.allclose(state.means, x, rtol=0, atol=1e-10)
         assert np.allclose(state.covariances, p, rtol=0, atol=1e-10)
@@ -265,6 +273,7 @@ def test_missing_components_agents_without_sensors_and_known_constants(
     _, seen = data(sensors)
     values = [None if y is None else y.copy() for y in seen]
     assert values[1] is not None
+    # Every other time the first of two components is missing.
     values[1][::2, 0] = np.nan
     f = InformationConsensusFilter(
         model(), sensors, NET, fusion=finite_time_consensus, average=average
@@ -282,12 +291,14 @@ def test_a_constant_that_all_know_in_consensus_on_measurements() -> None:
         average="measurements",
     )
     state = f.step(f.start(([0.0, 5.0], np.diag([1.0, 0.0]))), 1.0, [[2.0]] * 6)
+    # Six observations of 2 and a prior of 0 with equal weights
     assert np.allclose(state.means, [12 / 7, 5.0])
     assert np.allclose(state.covariances[:, 0, 0], 1 / 7)
 
 
 def test_without_links_agents_filter_alone() -> None:
     _, seen = data(observing())
+    # No rule is applied, and a sum needs no average.
     f = consensus_filter(average_consensus, graph=lambda t: np.zeros((6, 6)))
     g = GaussianFilter(model(), observing(), share_observations=False)
     assert np.allclose(last_of(f, seen).means, last_of(g, seen).means)
@@ -295,7 +306,7 @@ def test_without_links_agents_filter_alone() -> None:
 
 @pytest.mark.parametrize("linearization", ["extended", "unscented"])
 def test_angles_and_nonlinear_sensors(linearization: Any) -> None:
-    """As Kalman filters that flood their bearings, as long as the agents agree."""
+    """As Kalman filters that flood their bearings, as long as their means are equal."""
     places = [[-2.0, 0.0], [0.0, -2.0], [2.0, 0.0], [0.0, 2.0], [2.0, 2.0], [-2.0, 2.0]]
     sensors = [bearing([0, 1], std=0.05, origin=p) for p in places]
     options: dict[str, Any] = {"linearization": linearization}
@@ -304,6 +315,7 @@ def test_angles_and_nonlinear_sensors(linearization: Any) -> None:
     )
     g = GaussianFilter(still_model(2), sensors, NET, hops="all", **options)
     prior = ([0.5, 0.3], 0.01 * np.eye(2))
+    # Observations without noise of a place within the prior's spread
     seen = [s.predict(np.array([0.45, 0.35])) for s in sensors]
     one = f.step(f.start(prior), 1.0, seen)
     other = g.step(g.start(prior), 1.0, seen)
@@ -318,6 +330,7 @@ def test_runs_of_a_batch_lose_their_own_messages() -> None:
     exact = consensus_filter(rule)
     state = last_of(f, seen, (8,))
     assert np.isfinite(state.means).all()
+    # Lost messages change every run, and spoil none.
     difference = np.abs(state.means - last_of(exact, seen, (8,)).means).max(axis=(1, 2))
     assert (difference > 1e-6).all()
     assert (np.linalg.eigvalsh(state.covariances) > 0).all()

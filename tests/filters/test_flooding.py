@@ -1,4 +1,4 @@
-"""Observations that travel over several links: who has them, and what they cost."""
+"""Observations that travel over several links: who has them, and their cost."""
 
 from __future__ import annotations
 
@@ -41,6 +41,7 @@ def last_state(
     sensors = team(graph.n_agents)
     _, seen = data(sensors, options.pop("runs", ()))
     runs = seen[0].shape[1:-1]
+    # Every family is made alike, and draws from the same stream.
     f = FAMILIES[family](model(), sensors, graph, hops=hops, **options)
     state = f.start(PRIOR, rng=default_rng(3), runs=runs)
     *_, last = f.steps(state, TIMES, seen)
@@ -116,13 +117,14 @@ def test_on_a_tree_an_observation_crosses_every_link_once(graph: Graph) -> None:
 
 
 def test_lost_messages_run_by_run() -> None:
-    """Each run of a batch has what it would have alone, also by a second way."""
+    """Each run of a batch has the observations that it would have alone, by a second way too."""
     graph = graphs.ring(6)
     sensors = [component([0], std=1.0)] * 6
     faults = Faults(loss=0.3, seed=4)
     f = GaussianFilter(still_model(1), sensors, graph, hops="all", faults=faults)
     values = default_rng(0).standard_normal((6, 40, 1))
     state = f.step(f.start(([0.0], [[1.0]]), runs=(40,)), 1.0, list(values))
+    # 1 / P = 1 + number of observations, in each run
     count = 1 / state.covariances[..., 0, 0] - 1
     # From its own plan of losses, by hand.
     expected = np.zeros((40, 6, 6), dtype=bool)

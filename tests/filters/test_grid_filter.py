@@ -55,6 +55,7 @@ def test_linear_beliefs_are_those_of_kalman_filters() -> None:
 
     sensors = team()
     _, seen = data(sensors)
+    # All agents have all observations, so that both are one filter of all of them.
     f = GridFilter(WIDE, sensors, NET, grid=BOX, hops="all")
     g = GaussianFilter(WIDE, sensors, NET, hops="all")
     a = f.summarize(last_of(f, PRIOR, seen))
@@ -109,6 +110,7 @@ def test_a_nonlinear_transition_by_its_integral() -> None:
     f = GridFilter(Model(1, bend, lambda t, dt: 0.1 * np.eye(1)), [None], grid=LINE)
     state = f.step(f.start(([0.3], [[1.0]]), t=0.5), 1.0, [None])
     z = np.linspace(-8.0, 8.0, 4001)
+    # The density at the centres, times the volume of a cell
     p = norm(bend(z, 0.5, 0.5), np.sqrt(0.1)).pdf(LINE.centres) * norm(0.3, 1.0).pdf(z)
     expected = np.trapezoid(p, z, axis=1) * LINE.volume
     assert np.allclose(state.masses[0], expected, atol=1e-8)
@@ -156,6 +158,7 @@ def test_averaged_likelihoods_are_all_observations() -> None:
         component([1], std=0.7),
         None,
     ]
+    # A distance and a bearing among them, whose likelihoods are not Gaussian.
     seen: list[Any] = [[0.8], [1.1], [0.4], [0.2], None]
     f = GridFilter(
         WIDE, sensors, NET, grid=BOX, share_observations=False, fused="likelihoods",
@@ -205,6 +208,7 @@ def test_runs_gates_losses_and_files(tmp_path: Any) -> None:
         faults=Faults(loss=0.3, seed=1),
     )
     state = f.start(PRIOR, runs=(3,))
+    # One observation of one run is far off.
     rejected = np.zeros((3, 5))
     for k, t in enumerate(TIMES):
         state = f.step(state, float(t), [None if y is None else y[k] for y in seen])
@@ -223,6 +227,7 @@ def test_a_run_in_which_nothing_is_possible_fails_alone() -> None:
         still_model(1), [Sensor(1, lambda x: np.where(x > 0, 1.0, np.nan), [[1e-3]])],
         grid=LINE, on_error="keep",
     )  # fmt: skip
+    # In the second run the value is beyond every cell's prediction.
     state = f.start(([0.0], [[1.0]]), runs=(2,))
     with np.errstate(over="ignore"):
         state = f.step(state, 0.0, [np.array([[1.0], [1e300]])])
@@ -245,12 +250,14 @@ def test_counts_as_a_likelihood() -> None:
     f = GridFilter(still_model(1), [sensor], grid=LINE)
     state = f.step(f.start(([0.0], [[1.0]])), 0.0, [[3.0]])
     x = LINE.centres[:, 0]
+    # Poisson likelihood times the normal prior
     expected = np.exp(3 * x - np.exp(x) - 0.5 * x**2)
     assert np.allclose(state.masses[0], expected / expected.sum(), atol=1e-12)
 
 
 def test_a_box_that_is_too_small_warns_once() -> None:
     f = GridFilter(still_model(1, 4.0), [None], grid=Grid((40,), low=-3.0, high=3.0))
+    # Its deviation grows by two in a step, to beyond the box.
     state = f.start(([0.0], [[1.0]]))
     with pytest.warns(RuntimeWarning, match="grid must have a box in which") as caught:
         for t in (1.0, 2.0, 3.0):

@@ -19,6 +19,7 @@ CUBE = Sensor(1, lambda x: x**3, [[0.04]], derivative=lambda x: 3 * x[..., None]
 
 def test_the_limit_is_the_maximum_of_the_posterior() -> None:
     """Minus log density (x - 1)² / 2 + (y - x³)² / 0.08, and its curvature by Gauss-Newton."""
+    # Enough steps of Gauss and Newton to converge
     f = GaussianFilter(still_model(1), [CUBE], iterations=30)
     state = f.step(f.start(([1.0], [[1.0]])), 0.0, [[5.0]])
 
@@ -60,6 +61,7 @@ def test_two_iterations_by_hand_with_missing_numbers_and_several_agents() -> Non
             np.eye(2),
         ),
     ]
+    # A full covariance, and a component that is missing
     prior = (np.array([1.0, 0.5]), np.array([[0.5, 0.1], [0.1, 0.4]]))
     rng = default_rng(0)
     seen = [rng.standard_normal(s.dim) + s.predict(prior[0]) for s in sensors]
@@ -80,6 +82,7 @@ def _update(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the update of a prior by a sensor that is linearised at x."""
     m, p = prior
+    # Present components only: rows of H and blocks of R
     h = sensor.jacobian(x)[present]
     r = sensor.residual(y, sensor.predict(x))[present] - h @ (m - x)
     noise = sensor.noise_cov[np.ix_(present, present)]
@@ -112,6 +115,7 @@ def test_where_a_later_point_cannot_see() -> None:
     """The first linearisation is kept."""
     root = Sensor(1, lambda x: np.where(x > 0, x**2, np.nan), [[1e-4]])
     f = GaussianFilter(still_model(1), [root], iterations=3)
+    # The first step leads to a negative state, from where nothing can be seen.
     state = f.step(f.start(([1.0], [[9.0]])), 0.0, [[-4.0]])
     g = GaussianFilter(still_model(1), [root])
     once = g.step(g.start(([1.0], [[9.0]])), 0.0, [[-4.0]])

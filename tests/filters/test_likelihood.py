@@ -54,6 +54,7 @@ def test_quadratic_likelihoods_are_exact() -> None:
     _, seen = data(sensors, (2,))
     a = last_of(make(LikelihoodConsensusFilter), seen, (2,))
     b = last_of(make(ParticleFilter), seen, (2,))
+    # The same ancestors and the same noise
     assert np.allclose(a.particles, b.particles, atol=1e-9)
     assert np.allclose(a.weights, b.weights, atol=1e-9)
     # Five monomials of degree one and two on each link and round.
@@ -64,6 +65,7 @@ def test_few_rounds_are_close_and_more_are_closer() -> None:
     _, seen = data(team())
     exact = make(ParticleFilter)
     expected = exact.summarize(last_of(exact, seen)).mean
+    # With many particles, whose sampling error is below that of one round.
     errors = []
     for rounds in (1, 10, 80):
         rule = partial(average_consensus, rounds=rounds)
@@ -81,6 +83,7 @@ def test_higher_degrees_follow_curved_sensors() -> None:
         kind = distance if k % 2 else bearing
         sensors.append(kind([0, 1], std=0.4 if k % 2 else 0.2, origin=place))
     sensors.append(None)
+    # Observations without noise of one place
     truth = np.array([0.9, 0.4])
     seen = [None if s is None else s.predict(truth) for s in sensors]
     prior = ([0.0, 0.0], 0.25 * np.eye(2))
@@ -105,6 +108,7 @@ def test_higher_degrees_follow_curved_sensors() -> None:
 def test_the_centre_and_scale_of_the_basis_do_not_matter_to_a_fit() -> None:
     """Polynomials of other coordinates are the same functions."""
     _, seen = data(team())
+    # Another origin, and another unit for each component
     far = PolynomialBasis(
         [0, 1], centre=np.array([5.0, -3.0]), scale=np.array([2.0, 9.0])
     )
@@ -119,6 +123,7 @@ def test_a_basis_of_the_users_own() -> None:
     def basis(x: np.ndarray) -> np.ndarray:
         return np.concatenate([np.abs(x), x**2], axis=-1)
 
+    # (y - |x|)² / 2 = x² / 2 - y |x| + a constant
     sensors = [Sensor(1, np.abs, [[1.0]])] * 5
     f = make(
         LikelihoodConsensusFilter,
@@ -153,6 +158,7 @@ def test_particles_that_contradict_an_observation_have_little_weight() -> None:
 
 def test_gate_losses_runs_and_failures() -> None:
     _, seen = data(team(), (3,))
+    # One observation of one run is far off.
     seen[0][2, 1] += 80.0
     rule = partial(average_consensus, rounds=20)
     f = make(
@@ -193,6 +199,7 @@ def test_what_is_refused() -> None:
     with pytest.raises(ValueError, match="^basis must have"):
         f.step(f.start(PRIOR, rng=default_rng(0)), 0.1, seen)
     f = make(LikelihoodConsensusFilter, lag=1)
+    # A kept time would be there for a delayed observation.
     state = f.step(f.start(PRIOR, rng=default_rng(0)), 0.1, seen)
     state = f.step(state, 0.2, seen)
     with pytest.raises(ValueError, match="^delayed must be empty here"):

@@ -59,6 +59,7 @@ def test_a_split_is_close_to_its_gaussian_and_keeps_the_moments(parts: int) -> N
 def test_a_split_of_some_components_keeps_full_moments(axes: Any) -> None:
     root = default_rng(0).standard_normal((3, 3))
     cov = root @ root.T + 0.1 * np.eye(3)
+    # A full covariance, so that a wrong order of components would show.
     split = split_gaussian([1.0, 2.0, 3.0], cov, parts=3, axes=axes)
     assert split.n_components == 3 ** len(axes or range(3))
     mean, whole = split.moments()
@@ -110,6 +111,7 @@ def test_linear_components_are_those_of_the_mixture_filter() -> None:
     f = GaussianSumFilter(model(), team(3), share_observations=False)
     g = MixtureFilter(model(), team(3), target_dim=2)
     prior = mixture()
+    # Step by step, since one of them follows single runs only.
     a = f.start(prior)
     b = g.start(prior)
     for k, t in enumerate(TIMES):
@@ -134,6 +136,7 @@ def test_the_evidence_is_the_density_of_the_mixture() -> None:
         still_model(1), [component([0], std=0.5)], record_evidence=True
     )
     state = f.step(f.start(prior), 1.0, [[0.7]])
+    # Σ w_l N(y; m_l, P_l + R)
     std = np.sqrt(prior.covs[:, 0, 0] + 0.25)
     density = (prior.weights * norm(prior.means[:, 0], std).pdf(0.7)).sum()
     assert np.allclose(state.log_likelihood, np.log(density))
@@ -148,6 +151,7 @@ def test_two_peaks_by_quadrature() -> None:
     """A square is observed: the belief has two peaks, which a Kalman filter cannot have."""
     sensor = Sensor(1, lambda x: x**2, [[0.04]], derivative=lambda x: 2 * x[..., None])
     x = np.linspace(-5.0, 5.0, 20001)
+    # Prior times likelihood, on a fine grid
     posterior = norm(0.3, 1.0).pdf(x) * norm(x**2, 0.2).pdf(1.0)
     posterior /= np.trapezoid(posterior, x)
     mean = np.trapezoid(posterior * x, x)

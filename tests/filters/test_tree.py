@@ -1,4 +1,4 @@
-"""Channel filters on a tree: what reaches an agent, and nothing twice."""
+"""Channel filters on a tree: all information reaches an agent, and none twice."""
 
 from __future__ import annotations
 
@@ -48,6 +48,7 @@ def run(f: Any, seen: list[np.ndarray], quiet: int, runs: tuple[int, ...] = ()) 
     state = f.start(PRIOR, runs=runs)
     for k, t in enumerate(TIMES):
         state = f.step(state, float(t), [y[k] for y in seen])
+    # Steps in which nothing is observed, but beliefs are exchanged.
     for k in range(quiet):
         state = f.step(state, float(TIMES[-1]) + 0.1 * (k + 1), [None] * 5)
     return state
@@ -57,6 +58,7 @@ def central(seen: list[np.ndarray], quiet: int) -> tuple[np.ndarray, np.ndarray]
     """Return the Kalman filter of all observations, at the end of the quiet steps."""
     steps = [*np.diff(TIMES, prepend=0.0), *[0.1] * quiet]
     model = rotation()
+    # One sensor with all components stands for the network.
     h = np.concatenate([s.H(2) for s in sensors()])
     noise = np.zeros((len(h), len(h)))
     start = 0
@@ -65,6 +67,7 @@ def central(seen: list[np.ndarray], quiet: int) -> tuple[np.ndarray, np.ndarray]
         noise[start:stop, start:stop] = s.noise_cov
         start = stop
     y = np.concatenate(seen, axis=-1)
+    # In the quiet steps all components are missing.
     y = np.concatenate([y, np.full((quiet, *y.shape[1:]), np.nan)])
     result = kalman_filter(
         *PRIOR,
@@ -101,6 +104,7 @@ def test_information_travels_one_link_a_step(tree: Graph) -> None:
     f = ChannelFilter(still_model(1), [component([0], std=1.0)] * 5, tree)
     state = f.step(f.start(([0.0], [[1.0]])), 1.0, [[1.0]] * 5)
     for k in range(1, 5):
+        # 1 / P = 1 + number of observations
         count = 1 / state.covariances.ravel() - 1
         expected = [(tree.hops(agent) <= k).sum() for agent in range(5)]
         assert np.allclose(count, expected)
@@ -112,6 +116,7 @@ def test_lost_messages_come_later() -> None:
     tree = TREES["fork"]
     seen = observations((7,))
     faults = Faults(loss=0.4, seed=3)
+    # Forty steps are enough for every link to be repaired.
     f = ChannelFilter(rotation(), sensors(), tree, faults=faults)
     state = run(f, seen, 40, (7,))
     mean, cov = central(seen, 40)
@@ -136,6 +141,7 @@ def test_a_failed_run_leaves_the_others_alone() -> None:
     bad = [y.copy() for y in seen]
     bad[0][1, 1] = 1e308
     bad[2][1, 1] = -1e308
+    # Two huge numbers of opposite sign overflow in the fusion.
     with np.errstate(all="ignore"):
         state = run(f, bad, 1, (3,))
     good = run(f, seen, 1, (3,))
@@ -154,10 +160,11 @@ def test_a_saved_state_goes_on(tmp_path: Any) -> None:
 
 
 def test_a_reset_is_common_knowledge() -> None:
-    """Links forget what the agents forget: all observations afterwards count once."""
+    """Links forget as the agents do: all observations afterwards count once."""
     f = ChannelFilter(still_model(2), sensors(), TREES["path"])
     state = run(f, observations(), 4)
     state = f.reset(state, [1], [0.0], [[1.0]])
+    # All agents have the same belief here, and so do the links.
     assert np.allclose(state.link_covariances, state.covariances[0])
     with pytest.raises(ValueError, match="^agents must be all of them"):
         f.reset(state, [1], [0.0], [[1.0]], agents=[0])
@@ -171,6 +178,7 @@ def test_a_reset_is_common_knowledge() -> None:
     ],
 )
 def test_other_graphs_are_refused(graph: Graph, text: str) -> None:
+    # The graph is looked at when messages are sent.
     f = ChannelFilter(rotation(), sensors(), graph)
     with pytest.raises(ValueError, match=text):
         f.step(f.start(PRIOR), 1.0, [None] * 5)
@@ -192,6 +200,7 @@ def test_a_nonlinear_sensor_with_angles() -> None:
     sensor = bearing([0, 1], std=0.1)
     f = ChannelFilter(still_model(2), [sensor] * 2, graphs.path(2))
     state = f.start(([-3.0, 0.1], 0.1 * np.eye(2)))
+    # Directions on both sides of the cut
     for k in range(3):
         state = f.step(state, 1.0 + k, [[3.1], [-3.1]])
     assert np.allclose(state.means[0], state.means[1], atol=1e-2)

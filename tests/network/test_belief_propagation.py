@@ -30,12 +30,15 @@ def system(
     joint = 0.1 * np.eye(n * d)
     for i, j in zip(graph.receivers, graph.senders, strict=True):
         if i < j:
+            # |B_i x_i + B_j x_j|² with two random blocks
             row = np.zeros((d, n * d))
             row[:, i * d : (i + 1) * d] = draw.standard_normal((d, d)) + 2 * np.eye(d)
             row[:, j * d : (j + 1) * d] = draw.standard_normal((d, d)) - 2 * np.eye(d)
             joint += row.T @ row
+    # A larger diagonal makes rounds converge on any graph.
     if slack:
         joint += slack * np.diag(np.abs(joint).sum(axis=1))
+    # J_ii of agents, and J_ij in the order of the links
     blocks = joint.reshape(n, d, n, d)
     matrices = np.array([blocks[k, :, k] for k in range(n)])
     couplings = np.array(
@@ -55,6 +58,7 @@ def test_marginals_on_a_tree_are_exact_after_the_diameter(tree: Graph, d: int) -
     assert np.allclose(means, expected, rtol=1e-8)
     for k in range(tree.n_agents):
         assert np.allclose(covs[k], inverse[k, :, k], rtol=1e-8)
+    # A vector and the upper triangle of a matrix on each link and round
     sent = (d + d * (d + 1) // 2) * max(tree.diameter, 1) * tree.out_degree
     assert (channel.ledger.scalars == sent).all()
 
@@ -67,6 +71,7 @@ def test_with_circles_means_are_exact_and_covariances_are_not(graph: Graph) -> N
     )
     expected = np.linalg.solve(joint, vectors.ravel()).reshape(-1, 2)
     assert np.allclose(means, expected, rtol=1e-8, atol=1e-10)
+    # Covariances are near, but not equal to, those of the whole.
     inverse = np.linalg.inv(joint).reshape(graph.n_agents, 2, graph.n_agents, 2)
     error = [
         np.abs(covs[k] / inverse[k, :, k] - 1).max() for k in range(graph.n_agents)
@@ -98,6 +103,7 @@ def test_lost_messages_only_cost_time_run_by_run() -> None:
     runs = np.tile(matrices, (4, 1, 1, 1)), np.stack([vectors * k for k in range(4)])
     channel = Channel(path, runs=(4,), faults=faults)
     means, _ = gaussian_belief_propagation(*runs, couplings, channel, rounds=60)
+    # Run k has k times the vector, and so k times the solution.
     expected = np.linalg.solve(joint, vectors.ravel()).reshape(-1, 2)
     for k in range(4):
         assert np.allclose(means[k], k * expected, atol=1e-9)

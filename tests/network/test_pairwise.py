@@ -30,6 +30,7 @@ def inverse(p: Array) -> Array:
 
 def is_below(small: Array, large: Array, tolerance: float = 1e-7) -> bool:
     """Whether large - small is positive semidefinite, relative to the larger one."""
+    # L⁻¹ S L⁻ᵀ has no eigenvalue above 1.
     lower = np.linalg.cholesky(large)
     white = np.linalg.solve(lower, np.linalg.solve(lower, small).mT)
     return bool((np.linalg.eigvalsh(0.5 * (white + white.mT)) < 1 + tolerance).all())
@@ -42,6 +43,7 @@ def gains(rule: Any, p_a: Array, p_b: Array) -> tuple[Array, Array, Array]:
     """
     d = p_a.shape[-1]
     zero = np.zeros(d)
+    # Column k is the response to a unit of the second mean along axis k.
     columns = [rule(zero, p_a, axis, p_b)[0] for axis in np.eye(d)]
     gain_b = np.stack(columns, axis=-1)
     return np.eye(d) - gain_b, gain_b, rule(zero, p_a, zero, p_b)[1]
@@ -50,6 +52,7 @@ def gains(rule: Any, p_a: Array, p_b: Array) -> tuple[Array, Array, Array]:
 def error_covariance(rule: Any, p_a: Array, p_b: Array, cross: Array) -> Array:
     """Return the covariance of the fused error, for a cross-covariance E[e_a e_bᵀ]."""
     k, g, _ = gains(rule, p_a, p_b)
+    # K P_a Kᵀ + G P_b Gᵀ + K C Gᵀ + G Cᵀ Kᵀ
     mixed = k @ cross @ g.mT
     return k @ p_a @ k.mT + g @ p_b @ g.mT + mixed + mixed.mT
 
@@ -121,6 +124,7 @@ def test_the_weight_makes_the_result_smallest(fuse: Any, rule: str) -> None:
             return np.trace(cov, axis1=-2, axis2=-1)
         return np.linalg.slogdet(cov)[1]
 
+    # No weight of a fine grid gives a smaller one.
     others = [size(omega=w) for w in np.linspace(0.0, 1.0, 201)]
     assert (size() < np.min(others, axis=0) + 1e-4 * np.abs(size())).all()
 
@@ -330,6 +334,7 @@ def test_angles_are_fused_the_shorter_way_round(name: str) -> None:
     m = np.array([[3.1, 0.0], [-3.1, 1.0], [3.0, 2.0]])
     p = np.array([np.diag([1.0, 2.0]), np.diag([2.0, 1.0]), np.eye(2)])
     means, covs = rule((m, p), channel)
+    # The same places on one branch
     turned = m + [[0, 0], [2 * np.pi, 0], [0, 0]]
     expected, expected_covs = rule((turned, p), star())
     difference = np.angle(np.exp(1j * (means[:, 0] - expected[:, 0])))
