@@ -210,9 +210,13 @@ def _has_far_members(scaled_cost: Array, rounding: float = _ROUNDING) -> bool:
     True
     False
     """
+    is_small = scaled_cost < _FAR
+    # Mostly even copies and near members together are few.
+    if 5 * np.count_nonzero(is_small) <= is_small.size:
+        return False
     # Copies of a member are at no distance, but for rounding.
     is_apart = scaled_cost > rounding
-    is_near = is_apart & (scaled_cost < _FAR)
+    is_near = is_apart & is_small
     return bool(4 * np.count_nonzero(is_near) > np.count_nonzero(is_apart))
 
 
