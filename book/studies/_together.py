@@ -29,11 +29,12 @@ from _together_cells import (
     make_likelihood_consensus,
 )
 from _together_filters import (
-    FloodingMixin,
     GridFilter,
+    IteratedGaussian,
     LikelihoodConsensus,
-    MeasurementConsensus,
     TargetExchangeFilter,
+    average_on_tree,
+    spanning_tree,
 )
 from _together_mixtures import BatchedMixtures
 from _together_problems import (
@@ -48,9 +49,9 @@ from _together_problems import (
     problem,
 )
 from _together_scoring import (
+    best_value,
     draw_data,
     ill_conditioned_columns,
-    log_scores,
     make_seeds,
     measure,
     measure_cells,
@@ -61,6 +62,7 @@ from _together_scoring import (
     score_filter,
     stream,
     tuned_value,
+    values_that_count,
 )
 
 __all__ = [
@@ -74,17 +76,17 @@ __all__ = [
     "TUNING",
     "BatchedMixtures",
     "Cell",
-    "FloodingMixin",
     "GridFilter",
+    "IteratedGaussian",
     "LikelihoodConsensus",
-    "MeasurementConsensus",
     "Problem",
     "TargetExchangeFilter",
+    "average_on_tree",
+    "best_value",
     "cell_names",
     "draw_data",
     "gaussian_maker",
     "ill_conditioned_columns",
-    "log_scores",
     "make_likelihood_consensus",
     "make_seeds",
     "measure",
@@ -97,8 +99,10 @@ __all__ = [
     "run_problem",
     "score_columns",
     "score_filter",
+    "spanning_tree",
     "stream",
     "tuned_value",
+    "values_that_count",
 ]
 
 MODULES = (

@@ -6,27 +6,34 @@ A cell makes its filter for any problem and for any value of its one tuned optio
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 from _together_filters import (
-    FloodedEnsemble,
-    FloodedGaussian,
-    FloodedGrid,
-    FloodedParticles,
     GridFilter,
+    IteratedGaussian,
     LikelihoodConsensus,
-    MeasurementConsensus,
     SharedPlanFilter,
     TargetExchangeFilter,
+    average_on_tree,
+    tree_graph,
 )
 from _together_mixtures import BatchedMixtures
 from _together_problems import STUDY, THREE, Problem
 
 from distfilt import network
-from distfilt.filters import EnsembleFilter, Filter, GaussianFilter, ParticleFilter
+from distfilt.filters import (
+    ChannelFilter,
+    EnsembleFilter,
+    Filter,
+    GaussianFilter,
+    GaussianSumFilter,
+    InformationConsensusFilter,
+    ParticleFilter,
+)
+from distfilt.mixtures import split_gaussian
 from distfilt.network import covariance_intersection
 from distfilt.triangular import separable
 from distfilt.updates import (
@@ -96,6 +103,11 @@ def gaussian_maker(
         )
 
     return make
+
+
+def consensus_maker(average: str, rule: Callable[..., Array]) -> Maker:
+    """Return a maker of Kalman filters that average information; the value is the inflation."""
+    return gaussian_maker(InformationConsensusFilter, average=average, fusion=rule)
 
 
 def ensemble_maker(
@@ -209,6 +221,45 @@ def mixture_maker(rule: str) -> Maker:
     return make
 
 
+@dataclass(frozen=True, eq=False)
+class SplitSum(GaussianSumFilter):
+    """A Gaussian sum filter that splits a Gaussian prior along its first two components."""
+
+    _: KW_ONLY
+    parts: int = 3
+
+    def initial_state(
+        self, prior: Any, runs: tuple[int, ...], rng: Any
+    ) -> dict[str, Any]:
+        """Return the parts of the prior."""
+        mixture = split_gaussian(*prior, parts=self.parts, axes=[0, 1])
+        return super().initial_state(mixture, runs, rng)
+
+
+def sum_maker(parts: int, hops: int | str) -> Maker:
+    """Return a maker of unscented Gaussian sums with a number of parts along two axes."""
+
+    def make(p: Problem, value: float) -> Filter:
+        return SplitSum(
+            p.model,
+            p.sensors,
+            p.graph,
+            parts=parts,
+            linearization="unscented",
+            inflation=value,
+            hops=hops,
+            on_error="keep",
+        )
+
+    return make
+
+
+def make_channel_filter(p: Problem, value: float) -> Filter:
+    """Make channel filters on a spanning tree of the graph."""
+    tree = tree_graph(p.graph)
+    return ChannelFilter(p.model, p.sensors, tree, inflation=value, on_error="keep")
+
+
 def target_maker(send_increments: bool) -> Maker:
     """Return a maker of filters of [target; own position]."""
 
@@ -240,11 +291,17 @@ BY_DETERMINANT = partial(covariance_intersection, rule="min_determinant")
 BY_TRACE = partial(covariance_intersection, rule="trace")
 FOUR_ROUNDS = partial(covariance_intersection, rounds=4)
 TWO_ROUNDS = partial(network.average_consensus, rounds=2)
+FOUR_AVERAGES = partial(network.average_consensus, rounds=4)
 # Inflation below one serves underconfident filters, such as intersection.
-INFLATION = ("inflation", (0.9, 1.0, 1.05, 1.15, 1.3))
-JITTER = ("jitter", (0.0, 0.05, 0.1, 0.2, 0.4))
-GAIN = ("gain", (0.025, 0.05, 0.1, 0.2, 0.4))
-REJUVENATION = ("rejuvenation", (0.05, 0.1, 0.2, 0.4, 0.8))
+# The library accepts none below 0.5.
+INFLATION = (
+    "inflation",
+    (0.5, 0.6, 0.75, 0.9, 1.0, 1.05, 1.15, 1.3, 1.6, 2.2, 3.2, 4.5),
+)
+# No jitter, no gain and no rejuvenation are the natural lower ends.
+JITTER = ("jitter", (0.0, 0.05, 0.1, 0.2, 0.4, 0.7))
+GAIN = ("gain", (0.0, 0.003, 0.006, 0.0125, 0.025, 0.05, 0.1, 0.2, 0.3))
+REJUVENATION = ("rejuvenation", (0.0, 0.1, 0.2, 0.4, 0.8, 1.2, 1.8))
 SEPARABLE_FIT = partial(separable.fit, order=1, regularisation=0.05)
 SEPARABLE = partial(transport_map_update, fit=SEPARABLE_FIT)
 
@@ -267,6 +324,13 @@ NO_MAPS = exclude(
     ("linear", "star"),
     "the best map is affine: an ensemble with perturbed observations",
 ) + exclude(("places",), WIDE + "a map has more coefficients than members")
+NO_UNION = exclude(
+    ("places",), WIDE + "its search for the smallest union takes a minute a run"
+)
+NO_SUM = exclude(
+    ("linear", "places", "star"),
+    "a sum of Kalman filters of a linear problem is one Kalman filter",
+)
 NO_INCREMENTS = exclude(
     KNOWN_POSITIONS,
     "an observation is its own information increment: observations, one hop",
@@ -282,6 +346,7 @@ NO_GRID = tuple(
 # ----------------------------------------------------------------------------------------- cells
 
 EXTENDED = "Kalman, extended"
+ITERATED = "Kalman, iterated"
 UNSCENTED = "Kalman, unscented"
 PERTURBED = "ensemble, perturbed"
 KNOWN = "ensemble, known noise"
@@ -289,58 +354,150 @@ EXACT = "ensemble, exact draws"
 ROOT = "ensemble, square root"
 MAPS = "ensemble, separable maps"
 GRID = "density on a grid"
+SUM = "Gaussian sum of "
 
 ALONE = "nothing"
 NEAR = "observations, one hop"
+TWO_HOPS = "observations, two hops"
 FLOODED = "observations, flooded"
 INTERSECTED = "observations, CI by determinant"
 AVERAGED = "log-likelihoods, exact average"
 PARTIAL = "beliefs, partial fusion"
 
 KALMAN_CELLS = {
+    # The lower end of the scale: each agent has its own observations.
     "ekf_alone": Cell(
         EXTENDED, ALONE, gaussian_maker(share_observations=False), *INFLATION
     ),
+    # One value to each neighbour; an agent updates with all that it has.
     "ekf_near": Cell(EXTENDED, NEAR, gaussian_maker(), *INFLATION),
+    # Products of beliefs count what both have seen twice.
     "ekf_naive": Cell(
         EXTENDED,
         "beliefs, multiplied",
         gaussian_maker(share_observations=False, fusion=network.naive_fusion),
         *INFLATION,
     ),
+    # Weights in proportion to 1 / trace P, without a search.
     "ekf_trace": Cell(
         EXTENDED,
         "observations, CI by trace",
         gaussian_maker(fusion=BY_TRACE),
         *INFLATION,
     ),
+    # Weights that minimize the determinant of the fused covariance.
     "ekf_ci": Cell(
         EXTENDED, INTERSECTED, gaussian_maker(fusion=BY_DETERMINANT), *INFLATION
     ),
+    # Battistelli and Chisci (2014): four rounds of geometric means.
     "ekf_info": Cell(
         EXTENDED,
         "beliefs, four rounds of equal CI",
         gaussian_maker(share_observations=False, fusion=FOUR_ROUNDS),
         *INFLATION,
     ),
+    # A times an average of two rounds is not yet the sum.
     "ekf_two": Cell(
         EXTENDED,
         "information, two rounds",
-        gaussian_maker(MeasurementConsensus, agree=TWO_ROUNDS),
+        consensus_maker("measurements", TWO_ROUNDS),
         *INFLATION,
     ),
+    # As many rounds as the graph has different eigenvalues give the exact average.
     "ekf_meas": Cell(
         EXTENDED,
         "information, exact average",
-        gaussian_maker(MeasurementConsensus),
+        consensus_maker("measurements", network.finite_time_consensus),
         *INFLATION,
     ),
+    # Every agent is the joint filter.
     "ekf_flood": Cell(
         EXTENDED,
         FLOODED,
-        gaussian_maker(FloodedGaussian, share_observations=False),
+        gaussian_maker(hops="all"),
         *INFLATION,
     ),
+    # Half of the ring of eight lies within two hops, and the agent itself.
+    "ekf_hops": Cell(EXTENDED, TWO_HOPS, gaussian_maker(hops=2), *INFLATION),
+    # The mode of the posterior instead of one linearization.
+    "iekf_flood": Cell(
+        ITERATED, FLOODED, gaussian_maker(IteratedGaussian, hops="all"), *INFLATION
+    ),
+    # Two messages on each of A - 1 links, whatever A.
+    "ekf_tree": Cell(
+        EXTENDED,
+        "information, summed on a spanning tree",
+        consensus_maker("measurements", average_on_tree),
+        *INFLATION,
+    ),
+    # Beliefs less what both ends of a link know already.
+    "ekf_channel": Cell(
+        EXTENDED,
+        "beliefs, channel filter on a spanning tree",
+        make_channel_filter,
+        *INFLATION,
+    ),
+    # Kamal et al. (2013): A times the average of P⁻¹/A + HᵀR⁻¹H.
+    "ekf_icf": Cell(
+        EXTENDED,
+        "information and priors, four rounds (ICF)",
+        consensus_maker("weighted", FOUR_AVERAGES),
+        *INFLATION,
+    ),
+    # Battistelli et al. (2015), with γ = A: twice the numbers of the row above.
+    "ekf_hcmci": Cell(
+        EXTENDED,
+        "information, priors apart, four rounds (HCMCI)",
+        consensus_maker("hybrid", FOUR_AVERAGES),
+        *INFLATION,
+    ),
+    # Cattivelli and Sayed (2010): covariances are not sent.
+    "ekf_diffuse": Cell(
+        EXTENDED,
+        "observations, then means (diffusion)",
+        gaussian_maker(fusion=network.diffuse_means),
+        *INFLATION,
+    ),
+    # Less cautious than intersection: only what may be common is removed.
+    "ekf_inverted": Cell(
+        EXTENDED,
+        "observations, inverse CI",
+        gaussian_maker(fusion=network.inverse_covariance_intersection),
+        *INFLATION,
+    ),
+    # Along each direction the better of two estimates.
+    "ekf_ellipsoid": Cell(
+        EXTENDED,
+        "observations, ellipsoidal intersection",
+        gaussian_maker(fusion=network.ellipsoidal_intersection),
+        *INFLATION,
+    ),
+    # More cautious than intersection: either estimate may be wrong.
+    "ekf_union": Cell(
+        EXTENDED,
+        "observations, covariance union",
+        gaussian_maker(fusion=network.covariance_union),
+        *INFLATION,
+        excluded=NO_UNION,
+    ),
+    # Unscented points instead of derivatives, with three rules of exchange.
+    "ukf_near": Cell(
+        UNSCENTED, NEAR, gaussian_maker(linearization="unscented"), *INFLATION
+    ),
+    "ukf_hops": Cell(
+        UNSCENTED,
+        TWO_HOPS,
+        gaussian_maker(linearization="unscented", hops=2),
+        *INFLATION,
+    ),
+    # Diffusion with unscented points.
+    "ukf_diffuse": Cell(
+        UNSCENTED,
+        "observations, then means (diffusion)",
+        gaussian_maker(linearization="unscented", fusion=network.diffuse_means),
+        *INFLATION,
+    ),
+    # Intersection with unscented points.
     "ukf_ci": Cell(
         UNSCENTED,
         INTERSECTED,
@@ -350,11 +507,10 @@ KALMAN_CELLS = {
     "ukf_flood": Cell(
         UNSCENTED,
         FLOODED,
-        gaussian_maker(
-            FloodedGaussian, linearization="unscented", share_observations=False
-        ),
+        gaussian_maker(linearization="unscented", hops="all"),
         *INFLATION,
     ),
+    # What an observation adds about the target, r(n + 1) - r(r - 1)/2 numbers.
     "news": Cell(
         "information increments",
         "increments, one hop",
@@ -363,6 +519,7 @@ KALMAN_CELLS = {
         local=True,
         excluded=NO_INCREMENTS,
     ),
+    # Agents do not keep the correlation of their positions with each other.
     "own_ci": Cell(
         "Kalman of target and own position",
         "beliefs of the target, equal CI",
@@ -373,18 +530,23 @@ KALMAN_CELLS = {
     ),
 }
 ENSEMBLE_CELLS = {
+    # Evensen's filter: perturbed observations, sampled noise covariance.
     "enkf_near": Cell(
         PERTURBED, NEAR, ensemble_maker(enkf_sampled_covariance), *INFLATION
     ),
+    # The known R in place of the sampled one.
     "known_near": Cell(KNOWN, NEAR, ensemble_maker(enkf), *INFLATION),
+    # The published rule of Grange et al.: means pull each other.
     "known_pull": Cell(KNOWN, "observations, mean pull", make_mean_pull, *GAIN),
     "known_flood": Cell(
         KNOWN,
         FLOODED,
-        ensemble_maker(enkf, FloodedEnsemble, share_observations=False),
+        ensemble_maker(enkf, hops="all"),
         *INFLATION,
     ),
+    # Draws with exactly the moments of the fused Gaussian.
     "exact_ci": Cell(EXACT, INTERSECTED, make_exact_ensemble, *INFLATION),
+    # A square root that leaves the order of the members.
     "root_ci": Cell(
         ROOT,
         INTERSECTED,
@@ -394,21 +556,23 @@ ENSEMBLE_CELLS = {
     "root_flood": Cell(
         ROOT,
         FLOODED,
-        ensemble_maker(etkf, FloodedEnsemble, share_observations=False),
+        ensemble_maker(etkf, hops="all"),
         *INFLATION,
     ),
+    # Curved updates, one component after another.
     "maps_near": Cell(
         MAPS, NEAR, ensemble_maker(SEPARABLE), *INFLATION, excluded=NO_MAPS
     ),
     "maps_flood": Cell(
         MAPS,
         FLOODED,
-        ensemble_maker(SEPARABLE, FloodedEnsemble, share_observations=False),
+        ensemble_maker(SEPARABLE, hops="all"),
         *INFLATION,
         excluded=NO_MAPS,
     ),
 }
 PARTICLE_CELLS = {
+    # Particles with the same rules as Kalman filters.
     "pf_alone": Cell(
         "particles",
         ALONE,
@@ -417,6 +581,7 @@ PARTICLE_CELLS = {
         excluded=NO_CLOUD,
     ),
     "pf_near": Cell("particles", NEAR, particle_maker(), *JITTER, excluded=NO_CLOUD),
+    # Clouds are fused by their moments.
     "pf_ci": Cell(
         "particles",
         INTERSECTED,
@@ -424,6 +589,7 @@ PARTICLE_CELLS = {
         *JITTER,
         excluded=NO_CLOUD,
     ),
+    # Polynomials of the log-likelihood on common particles.
     "pf_agreed": Cell(
         "particles",
         "likelihood consensus",
@@ -434,19 +600,22 @@ PARTICLE_CELLS = {
     "pf_flood": Cell(
         "particles",
         FLOODED,
-        particle_maker(FloodedParticles, share_observations=False),
+        particle_maker(hops="all"),
         *JITTER,
         excluded=NO_CLOUD,
     ),
+    # Weights by all likelihoods, then optimal transport to equal weights.
     "ot_plain": Cell(
         "transport, plain", AVERAGED, transport_maker(), excluded=NO_CLOUD
     ),
+    # The second moment is corrected after the transport.
     "ot_right": Cell(
         "transport, corrected",
         AVERAGED,
         transport_maker(correct=True),
         excluded=NO_CLOUD,
     ),
+    # Noise gives the members a width again.
     "ot_young": Cell(
         "transport, rejuvenated",
         AVERAGED,
@@ -456,10 +625,28 @@ PARTICLE_CELLS = {
     ),
 }
 DENSITY_CELLS = {
+    # Parts of the prior follow both modes; no beliefs are sent.
+    "sum9_near": Cell(SUM + "9", NEAR, sum_maker(3, 1), *INFLATION, excluded=NO_SUM),
+    "sum9_hops": Cell(
+        SUM + "9", TWO_HOPS, sum_maker(3, 2), *INFLATION, excluded=NO_SUM
+    ),
+    # The more parts, the nearer to the exact posterior.
+    "sum4_flood": Cell(
+        SUM + "4", FLOODED, sum_maker(2, "all"), *INFLATION, excluded=NO_SUM
+    ),
+    "sum9_flood": Cell(
+        SUM + "9", FLOODED, sum_maker(3, "all"), *INFLATION, excluded=NO_SUM
+    ),
+    "sum16_flood": Cell(
+        SUM + "16", FLOODED, sum_maker(4, "all"), *INFLATION, excluded=NO_SUM
+    ),
+    # Mixtures of three, by the rules of chapter 7.
     "gm_c1": Cell("mixture, C1", PARTIAL, mixture_maker("C1"), *INFLATION, local=True),
     "gm_c2": Cell("mixture, C2", PARTIAL, mixture_maker("C2"), *INFLATION, local=True),
     "gm_c3": Cell("mixture, C3", PARTIAL, mixture_maker("C3"), *INFLATION, local=True),
+    # Exact but for the size of the cells, with three rules of exchange.
     "grid_near": Cell(GRID, NEAR, grid_maker(), excluded=NO_GRID),
+    # The geometric mean of all beliefs counts nothing twice, and is too wide.
     "grid_mean": Cell(
         GRID,
         "beliefs, geometric mean",
@@ -469,7 +656,7 @@ DENSITY_CELLS = {
     "grid_flood": Cell(
         GRID,
         FLOODED,
-        grid_maker(FloodedGrid, share_observations=False),
+        grid_maker(hops="all"),
         excluded=NO_GRID,
     ),
 }

@@ -1,12 +1,12 @@
-"""Filters of chapter 11 that the library does not have: flooding, consensus on information,
+"""Filters of chapter 11 that the library does not have: sums along a tree, iterated updates,
 exchange of target beliefs, likelihood consensus, and beliefs on a grid.
 
-All are families of the library's `Filter`: they differ in `next_state` alone.
+The filters are families of the library's `Filter`: they differ in `next_state` alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from functools import cache
 from typing import Any
@@ -14,96 +14,13 @@ from typing import Any
 import numpy as np
 
 from distfilt import filters, network
-from distfilt.filters import (
-    EnsembleFilter,
-    GaussianFilter,
-    Observation,
-    ParticleFilter,
-    Summary,
-)
+from distfilt.filters import GaussianFilter, ParticleFilter, Summary
 from distfilt.updates import resample
 from distfilt.updates.particles import log_likelihood
 
 Array = np.ndarray
 Information = tuple[Array, Array]
 """Information matrix (..., n, n) and information vector (..., n)."""
-
-# ------------------------------------------------------------------------------------- flooding
-
-
-class FloodingMixin:
-    """Flood the observations of a time before any agent filters.
-
-    An observation crosses a link at most once in each direction, with the
-    number of the agent that made it, until all agents have all observations.
-    """
-
-    def next_state(self, step: Any) -> Any:
-        """Flood, then go on as the family does."""
-        if step.channel is not None:
-            step.observations = flood_observations(
-                step.observations, step.channel, step.t
-            )
-        return super().next_state(step)  # type: ignore[misc]
-
-
-Box = dict[int, Observation]
-"""Observations by the number of the agent that made each."""
-
-
-def flood_observations(
-    observations: Sequence[Sequence[Observation]], channel: Any, t: float
-) -> list[list[Observation]]:
-    """Return all observations for every agent; each agent makes at most one."""
-    collected: list[Box] = [{r.agent: r for r in mine} for mine in observations]
-    fresh = [dict(box) for box in collected]
-    while any(fresh):
-        inbox = channel.broadcast([pack_observations(box) for box in fresh])
-        # Only observations that an agent did not have are sent on.
-        fresh = [
-            unpack_observations(payloads.values(), box, t)
-            for payloads, box in zip(inbox, collected, strict=True)
-        ]
-        for box, new in zip(collected, fresh, strict=True):
-            box.update(new)
-    return [[box[agent] for agent in sorted(box)] for box in collected]
-
-
-def pack_observations(box: Box) -> tuple[Array, ...] | None:
-    """Return the payload of some observations: values, then the makers' numbers."""
-    if not box:
-        return None
-    values = [observation.value for observation in box.values()]
-    makers = [
-        np.full((*value.shape[:-1], 1), agent)
-        for agent, value in zip(box, values, strict=True)
-    ]
-    return tuple(values + makers)
-
-
-def unpack_observations(payloads: Any, collected: Box, t: float) -> Box:
-    """Return the observations in some payloads that are not yet collected."""
-    fresh: Box = {}
-    for payload in payloads:
-        half = len(payload) // 2
-        for value, maker in zip(payload[:half], payload[half:], strict=True):
-            agent = int(maker.flat[0])
-            if agent not in collected:
-                fresh[agent] = Observation.construct(t, agent, value)
-    return fresh
-
-
-class FloodedGaussian(FloodingMixin, GaussianFilter):
-    """Kalman filters with the observations of all agents."""
-
-
-class FloodedEnsemble(FloodingMixin, EnsembleFilter):
-    """Ensemble filters with the observations of all agents."""
-
-
-class FloodedParticles(FloodingMixin, ParticleFilter):
-    """Particle filters with the observations of all agents."""
-
 
 # ------------------------------------------------------------------------------------- Gaussians
 
@@ -121,42 +38,121 @@ def add_information(m: Array, P: Array, J: Array, v: Array) -> tuple[Array, Arra
     return m, symmetrize(P)
 
 
+def forecast_gaussians(f: GaussianFilter, step: Any) -> tuple[Array, Array]:
+    """Return the forecast means and inflated covariances of all agents."""
+    t = step.state.t
+    means = step.state.means
+    F = f.model.jacobian(means, t, step.dt)
+    # P = F P Fᵀ + Q, times the square of the inflation
+    P = F @ step.state.covariances @ F.mT + f.model.Q(t, step.dt)
+    return f.model.step(means, t, step.dt), f.inflation**2 * P
+
+
+def spanning_tree(graph: Any) -> list[tuple[int, int]]:
+    """Return (agent, parent), nearest to the root first; the root has the fewest hops to all."""
+    # The root is the agent with the fewest links to all others.
+    hops = np.array([graph.hops(k) for k in range(graph.n_agents)])
+    root = int(hops.sum(axis=1).argmin())
+    depth = hops[root]
+    links = set(zip(graph.senders.tolist(), graph.receivers.tolist(), strict=True))
+    tree = []
+    for agent in np.argsort(depth, kind="stable").tolist():
+        if agent == root:
+            continue
+        # The first neighbour that is one link nearer
+        nearer = np.flatnonzero(depth == depth[agent] - 1).tolist()
+        parent = next(k for k in nearer if (agent, k) in links)
+        tree.append((agent, parent))
+    return tree
+
+
+def tree_graph(graph: Any) -> Any:
+    """Return the graph of the spanning tree's links alone."""
+    return network.Graph.from_edges(graph.n_agents, spanning_tree(graph))
+
+
+def average_on_tree(values: Array, channel: Any) -> Array:
+    """Return the average of vectors (*runs, A, k), summed up and down a spanning tree.
+
+    Belief propagation on a tree: each of its links carries two messages, for any number
+    of agents.
+    """
+    return sum_on_tree(values, channel) / channel.graph.n_agents
+
+
+def sum_on_tree(values: Array, channel: Any) -> Array:
+    """Return the sum of the agents' vectors (*runs, A, k), sent up and down a spanning tree."""
+    tree = spanning_tree(channel.graph)
+    # The own vector counts once.
+    total = values.copy()
+    # Leaves first: each agent adds up what came from below and sends it to its parent.
+    for agent, parent in reversed(tree):
+        sent = send_down(total[..., agent, :], channel, agent, [parent])
+        total[..., parent, :] += sent[..., 0, :]
+    # The root has the whole sum; each parent sends it to its children at once.
+    for parent in dict.fromkeys(parent for _, parent in tree):
+        children = [agent for agent, above in tree if above == parent]
+        total[..., children, :] = send_down(
+            total[..., parent, :], channel, parent, children
+        )
+    return total
+
+
+def send_down(value: Array, channel: Any, sender: int, receivers: list[int]) -> Array:
+    """Return a vector (*runs, k) as some neighbours receive it, (*runs, receivers, k).
+
+    By broadcast it is one transmission.
+    """
+    graph = channel.graph
+    payloads: list[Array | None] = [None] * graph.senders.size
+    links = []
+    for receiver in receivers:
+        is_link = (graph.senders == sender) & (graph.receivers == receiver)
+        links.append(int(np.flatnonzero(is_link)[0]))
+        payloads[links[-1]] = value
+    common: list[Array | None] = [None] * graph.n_agents
+    common[sender] = value
+    arrived = channel.unicast(payloads, common=common)
+    return np.stack([arrived[link] for link in links], axis=-2)
+
+
 @dataclass(frozen=True, eq=False)
-class MeasurementConsensus(GaussianFilter):
-    """Kalman filters that average HᵀR⁻¹H and HᵀR⁻¹z over the network and add A times the mean."""
+class IteratedGaussian(GaussianFilter):
+    """Extended Kalman filters whose update linearizes anew at each estimate, four times."""
 
     _: KW_ONLY
-    agree: Callable[..., Array] = network.finite_time_consensus
-    share_observations: bool = False
+    iterations: int = 4
 
     def next_state(self, step: Any) -> Any:
-        """Forecast, linearize, average the information, add it."""
-        t = step.state.t
-        d = self.model.dim
-        F = self.model.jacobian(step.state.means, t, step.dt)
-        m = self.model.step(step.state.means, t, step.dt)
-        P = F @ step.state.covariances @ F.mT + self.model.Q(t, step.dt)
-        P = self.inflation**2 * P
-        # [HᵀR⁻¹H, HᵀR⁻¹z] of each agent, side by side
-        information = np.zeros((*m.shape[:-1], d, d + 1))
+        """Forecast, and iterate the update with all observations of an agent."""
+        m, P = forecast_gaussians(self, step)
         for _, group in step.received():
             a = group.agents
-            H = group.jacobian(m[..., a, :])
-            predicted = group.predict(m[..., a, None, :])[..., 0, :]
-            innovation = group.target - predicted
-            # z = y - h(m) + H m is linear in the state.
-            z = innovation[..., None] + H @ m[..., a, :, None]
-            W = H.mT @ np.linalg.inv(group.noise)
-            information[..., a, :, :] = W @ np.concatenate([H, z], axis=-1)
-        # A symmetric matrix is sent by its upper triangle.
-        rows, columns = np.triu_indices(d, 0, d + 1)
-        numbers = np.ascontiguousarray(information[..., rows, columns])
-        total = self.n_agents * self.agree(numbers, step.channel)
-        information[..., rows, columns] = total
-        square = information[..., :d]
-        J = np.triu(square) + np.triu(square, 1).mT
-        m, P = add_information(m, P, J, information[..., d])
-        return step.end(joint_means=m, joint_covariances=P, dim=d, history=())
+            m[..., a, :], P[..., a, :, :] = iterate_update(
+                m[..., a, :], P[..., a, :, :], group, self.iterations
+            )
+        return step.end(
+            joint_means=m,
+            joint_covariances=symmetrize(P),
+            dim=self.model.dim,
+            history=(),
+        )
+
+
+def iterate_update(
+    m: Array, P: Array, group: Any, iterations: int
+) -> tuple[Array, Array]:
+    """Return Gaussians after an iterated extended update: Gauss-Newton steps to the mode."""
+    x = m
+    for _ in range(iterations):
+        H = group.jacobian(x, P)
+        S = H @ P @ H.mT + group.noise
+        gain = np.linalg.solve(S, H @ P).mT
+        # x ← m + K (y - h(x) - H (m - x))
+        innovation = group.target - group.predict(x[..., None, :])[..., 0, :]
+        innovation = innovation - (H @ (m - x)[..., None])[..., 0]
+        x = m + (gain @ innovation[..., None])[..., 0]
+    return x, P - gain @ S @ gain.mT
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +173,7 @@ class TargetExchangeFilter(GaussianFilter):
     def next_state(self, step: Any) -> Any:
         """Forecast, update with the own observation, exchange, add the received information."""
         n = self.target_dim
-        m, P = self._forecast_moments(step)
+        m, P = forecast_gaussians(self, step)
         before = target_information(m, P, n)
         m, P = condition_on_own(m, P, step)
         after = target_information(m, P, n)
@@ -199,13 +195,6 @@ class TargetExchangeFilter(GaussianFilter):
         m, P = add_information(m, P, J, v)
         return step.end(joint_means=m, joint_covariances=P, dim=d, history=())
 
-    def _forecast_moments(self, step: Any) -> tuple[Array, Array]:
-        t = step.state.t
-        F = self.model.jacobian(step.state.means, t, step.dt)
-        m = self.model.step(step.state.means, t, step.dt)
-        P = F @ step.state.covariances @ F.mT + self.model.Q(t, step.dt)
-        return m, self.inflation**2 * P
-
     def _terms(self, payloads: list[Array], own: Information) -> list[Information]:
         """Return the information that one agent adds, from its inbox and its own belief."""
         n = self.target_dim
@@ -222,7 +211,7 @@ class TargetExchangeFilter(GaussianFilter):
 def condition_on_own(m: Array, P: Array, step: Any) -> tuple[Array, Array]:
     """Return the Gaussians of all agents after an extended update with their own observations."""
     for _, group in step.received():
-        H = group.jacobian(m)
+        H = group.jacobian(m, P)
         gain = P @ H.mT @ np.linalg.inv(H @ P @ H.mT + group.noise)
         innovation = group.target - group.predict(m[..., None, :])[..., 0, :]
         m = m + (gain @ innovation[..., None])[..., 0]
@@ -232,12 +221,14 @@ def condition_on_own(m: Array, P: Array, step: Any) -> tuple[Array, Array]:
 
 def target_information(mean: Array, cov: Array, n: int) -> Information:
     """Return information matrix and vector of the first n components."""
+    # Of a joint Gaussian the marginal of the target is a block.
     matrix = np.linalg.inv(cov[..., :n, :n])
     return matrix, (matrix @ mean[..., :n, None])[..., 0]
 
 
 def upper_triangle(belief: Information) -> Array:
     """Return the upper triangle of a symmetric matrix, then a vector."""
+    # A symmetric matrix has n (n + 1) / 2 different numbers.
     matrix, vector = belief
     rows, columns = np.triu_indices(matrix.shape[-1])
     return np.concatenate([matrix[..., rows, columns], vector], axis=-1)
@@ -262,6 +253,7 @@ def unpack_information(
     numbers: Array, n: int, increment: bool, rank: int = 2
 ) -> Information:
     """Return information matrix and vector from a payload of either kind."""
+    # An increment has as many rows as its observation has components.
     height = rank if increment else n
     rows, columns = np.triu_indices(height, 0, n)
     H = np.zeros((*numbers.shape[:-1], height, n))
@@ -317,6 +309,7 @@ class LikelihoodConsensus(ParticleFilter):
         self, prior: Any, runs: tuple[int, ...], rng: Any
     ) -> dict[str, Any]:
         """Draw the same particles for all agents."""
+        # One cloud for all agents, from one generator
         points = self.draw_prior(prior, (*runs, 1), rng)
         points = np.repeat(points, self.n_agents, axis=-3)
         log_weights = np.full(points.shape[:-1], -np.log(self.members))
@@ -355,6 +348,7 @@ class LikelihoodConsensus(ParticleFilter):
 
 def orthonormal_polynomials(x: Array, degree: int) -> Array:
     """Return polynomials orthonormal on points (..., N, k), without the constant."""
+    # Standardized, so that powers stay of the size of one
     u = (x - x.mean(axis=-2, keepdims=True)) / x.std(axis=-2, keepdims=True)
     dims = x.shape[-1]
     exponents = [p for p in np.ndindex(*[degree + 1] * dims) if sum(p) <= degree]
@@ -469,10 +463,6 @@ class GridFilter(
         return Summary(mean, np.diagonal(cov, axis1=-2, axis2=-1), cov)
 
 
-class FloodedGrid(FloodingMixin, GridFilter):
-    """Grid filters with the observations of all agents."""
-
-
 @cache
 def transition_matrix(cells: int, half: float, model: Any, dt: float) -> Any:
     """Return the sparse matrix that moves cell probabilities by one step of a linear model."""
@@ -496,5 +486,6 @@ def transition_matrix(cells: int, half: float, model: Any, dt: float) -> Any:
 
 def cell_centres(cells: int, half: float) -> Array:
     """Return the centres of the cells of a square from -half to half, (n, 2)."""
+    # A cell stands for its centre.
     line = (np.arange(cells) + 0.5) * (2 * half / cells) - half
     return np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)

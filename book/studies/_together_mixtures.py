@@ -67,6 +67,7 @@ class BatchedMixtures(
         self, prior: Any, runs: tuple[int, ...], rng: Any
     ) -> dict[str, Any]:
         """Return one component, and places for more."""
+        # The first place has the whole weight.
         mean, cov = prior
         leading = (*runs, self.n_agents, self.n_components)
         d = len(mean)
@@ -194,6 +195,7 @@ def divided_differences(values: Array) -> tuple[Array, Array, Array]:
     plus = values[..., 1 : d + 1, :]
     minus = values[..., d + 1 :, :]
     even = plus + minus - 2 * centre
+    # Mean by Stirling's interpolation of second order
     mean = centre[..., 0, :] + even.sum(axis=-2) / 6
     return mean, (plus - minus).mT / (2 * STEP), even.mT * np.sqrt(2.0) / 6
 
@@ -312,6 +314,7 @@ def fuse_pairs(own: Mixtures, other: Mixtures, omega: float) -> tuple[Array, Arr
     _, m_b, P_b = other
     n = m_b.shape[-1]
     d = m.shape[-1]
+    # Information of the target in both beliefs
     A = np.linalg.inv(P[..., :n, :n])
     A_b = np.linalg.inv(P_b)
     # J = ω A + (1 - ω) B of each pair
@@ -336,6 +339,7 @@ def interpolate_heights(
     logs: Array, means: Array, covs: Array, peaks: Array, alive: Array
 ) -> Array:
     """Return log-heights for which the mixture takes given values at its means (rule C3)."""
+    # Heights h with Σ h_j exp(-½ d²ᵢⱼ) = value at the mean of i
     values = np.exp(logs - logs.max(axis=-1, keepdims=True))
     densities = component_log_densities(means, means, covs)
     matrix = np.exp(densities - peaks[..., None, :])
@@ -368,6 +372,7 @@ def merge_covariances(
     share: Array, m_i: Array, m_j: Array, P_i: Array, P_j: Array
 ) -> Array:
     """Return the covariance of two merged components, the first with a share of the weight."""
+    # Within both, and between their means
     x = m_j - m_i
     a = share[..., None, None]
     between = a * (1 - a) * x[..., :, None] * x[..., None, :]
@@ -377,6 +382,7 @@ def merge_covariances(
 def cost_table(w: Array, m: Array, P: Array, dets: Array) -> Array:
     """Return the costs of all pairs i < j, (B, n, n); infinite elsewhere."""
     batches, n = w.shape
+    # Every pair once
     rows, columns = np.triu_indices(n, 1)
     i = np.broadcast_to(rows, (batches, rows.size))
     j = np.broadcast_to(columns, (batches, rows.size))

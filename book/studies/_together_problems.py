@@ -73,8 +73,10 @@ class Problem:
 
     def simulate(self, runs: int, rng: np.random.Generator) -> Data:
         """Draw truths (T, runs, d) and observations (T, runs, m), NaN where an agent is silent."""
+        # The truth starts from the prior and draws process noise.
         first = rng.multivariate_normal(*self.prior, size=runs)
         truth = models.simulate(self.model, first, self.times, rng=rng)
+        # Each sensor has errors of its own.
         observed = [sensor.observe(truth, rng=rng) for sensor in self.sensors]
         if self.silent is not None:
             for agent, values in enumerate(observed):
@@ -83,6 +85,7 @@ class Problem:
 
     def scored_truth(self, truth: Array) -> dict[str, Array]:
         """The truth of the scored components, by name."""
+        # Errors are scored by name: of a joint state only the target counts.
         names = list(self.model.names)
         return {name: truth[..., names.index(name)] for name in self.scored}
 
@@ -102,7 +105,9 @@ def observation_times(s: Scenario) -> Array:
 def linear(s: Scenario = LINEAR, agents: int | None = None) -> Problem:
     """Eight agents on a ring observe one coordinate each of a walker."""
     agents = agents or s["agents"]
+    # ṗ = v and v̇ = σ ẇ
     model = replace(models.constant_velocity(sigma=s["sigma"]), names=WALKER)
+    # z = x for even agents and z = y for odd ones
     coordinates = [
         sensors.component([k % 2], std=s["reading_std"]) for k in range(agents)
     ]
@@ -116,6 +121,7 @@ def linear(s: Scenario = LINEAR, agents: int | None = None) -> Problem:
         s["burn"],
         WALKER,
         scenario=s,
+        traits=("linear",),
     )
 
 
@@ -128,6 +134,7 @@ def rotation(angle: float) -> Array:
 
 def silence(s: Scenario, agents: int) -> Array:
     """Return who is silent when, (T, A): in each spell all agents but two on a diameter."""
+    # Steps are counted from zero; the end of a spell is not in it.
     silent = np.zeros((s["steps"], agents), dtype=bool)
     for (begin, end), quarter in zip(s["silences"], s["speakers"], strict=True):
         diameter = np.array([0, agents // 2]) + quarter * (agents // 4)
@@ -152,6 +159,7 @@ def ranges(s: Scenario = RANGE, agents: int | None = None) -> Problem:
     angle = 2 * np.pi * np.arange(agents) / agents
     places = s["radius"] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     std = s["reading_std"]
+    # z = |p - sᵢ|
     rangers = [sensors.distance([0, 1], std=std, origin=place) for place in places]
     return Problem(
         "range",
@@ -171,6 +179,7 @@ def ranges(s: Scenario = RANGE, agents: int | None = None) -> Problem:
 def lorenz(s: Scenario = LORENZ, agents: int | None = None) -> Problem:
     """Three agents on a path observe one component each of the Lorenz system of 1963."""
     agents = agents or s["agents"]
+    # The parameters 10, 28 and 8/3 are those of 1963.
     model = models.lorenz63(sigma=s["sigma"], step=s["longest_step"])
     std = s["reading_std"]
     components = [sensors.component([k % 3], std=std) for k in range(agents)]
@@ -217,12 +226,13 @@ def places(s: Scenario = PLACES, agents: int | None = None) -> Problem:
         WALKER,
         local=local,
         scenario=s,
-        traits=("doubted",),
+        traits=("linear", "uncertain"),
     )
 
 
 def target_and_egos(s: Scenario, agents: int) -> tuple[LinearModel, Array]:
     """Return model and prior covariance of [target; agents]; the agents stand still."""
+    # The target walks; the agents have no noise.
     walk = models.constant_velocity(sigma=s["sigma"])
     d = 4 + 2 * agents
 
@@ -236,10 +246,12 @@ def target_and_egos(s: Scenario, agents: int) -> tuple[LinearModel, Array]:
         Q[:4, :4] = walk.Q(t, dt)
         return Q
 
+    # Names such as x0, y0, x1 for the agents' positions
     egos = [f"{axis}{agent}" for agent in range(agents) for axis in "xy"]
     names = WALKER + tuple(egos)
     model = LinearModel.from_transition(d, transition, noise, names=names)
     ego_stds = [s["ego_std"]] * (2 * agents)
+    # The prior has no correlation between target and agents.
     stds = list(s["prior_std"]) + ego_stds
     return model, np.diag(np.square(stds))
 
@@ -282,6 +294,7 @@ def star(s: Scenario = HELD, agents: int | None = None) -> Problem:
         s["burn"],
         SPACE,
         scenario=s,
+        traits=("linear",),
     )
 
 
@@ -289,6 +302,7 @@ def angles(s: Scenario = HELD, agents: int | None = None) -> Problem:
     """Agents along a road observe bearings of a walker; the graph is complete."""
     agents = agents or s["road_agents"]
     model = replace(models.constant_velocity(sigma=s["road_sigma"]), names=WALKER)
+    # Sensors stand on a road beside the target, so that no bearing wraps.
     road = np.linspace(-6, 6, agents)
     places = np.stack([road, np.full(agents, -8.0)], axis=-1)
     std = s["angle_std"]
@@ -310,6 +324,7 @@ def angles(s: Scenario = HELD, agents: int | None = None) -> Problem:
 def mirror(s: Scenario = HELD, agents: int | None = None) -> Problem:
     """Agents on a line measure ranges, which do not tell on which side of it the target is."""
     agents = agents or s["line_agents"]
+    # From a line the two sides look alike.
     line = np.linspace(-5, 5, agents)
     places = np.stack([line, np.zeros(agents)], axis=-1)
     std = s["range_std"]

@@ -1,9 +1,12 @@
-"""Results of chapter 11's stored studies: ratios, fronts, Holm's test and a decision tree."""
+"""Results of chapter 11's stored studies: ratios, fronts, Holm's test, bills and operations.
+
+The decision tree that is learned from them stands in `_together_tree.py`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -17,20 +20,29 @@ FOUR = together.FOUR
 THREE = together.THREE
 CONSISTENT = (0.8, 1.25)
 """NEES per component of a filter that is called consistent; the text says where 0.95 to 1.05."""
-BUDGETS = (3, 12, 32, 64, 400)
+BUDGETS = (2, 5, 10, 20, 64)
 """Numbers that an agent may send in a step."""
-Row = tuple[str, float]
-"""A problem's name and a budget."""
+TO_CENTRE = "observations to a centre, estimate back"
+CENTRES = {
+    f"{family}_centre": replace(together.CELLS[f"{family}_flood"], exchange=TO_CENTRE)
+    for family in ("ekf", "ukf", "sum9", "known", "pf", "grid")
+}
+"""A centre that has all observations is the filter that floods them, with another bill."""
+CELLS = together.CELLS | CENTRES
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """A cell's runs: squared errors and NEES per component, (n,), and numbers sent a step."""
+    """A cell's runs: squared errors and NEES per component, (n,), and numbers sent a step.
+
+    `floats` counts the numbers link by link, `cast` by broadcast.
+    """
 
     cell: str
     error: np.ndarray
     nees: np.ndarray
     floats: float
+    cast: float
 
     @property
     def failed(self) -> int:
@@ -50,25 +62,59 @@ class Result:
 
 def stack_runs(stored: Any, name: str, score: str) -> np.ndarray:
     """Return a score of all runs of a cell, trial after trial."""
+    # A row of the file is a trial, with a column for each of its runs.
     runs = [stored.metric(f"{name}_{score}_{r}") for r in range(together.BATCH)]
     return np.stack(runs, axis=-1).ravel()
 
 
 def result(stored: Any, name: str, cell: str = "") -> Result:
     """Return a cell's result; `name` begins its columns."""
-    floats = float(stored.metric(f"{name}_floats").mean())
+    floats, cast = (
+        float(stored.metric(f"{name}_{bill}").mean()) for bill in ("floats", "cast")
+    )
     error = stack_runs(stored, name, "error")
     nees = stack_runs(stored, name, "nees")
-    return Result(cell or name, error, nees, floats)
+    return Result(cell or name, error, nees, floats, cast)
 
 
 @cache
 def results(name: str) -> dict[str, Result]:
-    """Return all cells of a problem, the reference first."""
+    """Return all cells of a problem, the reference first, those with a centre last."""
     stored = studies.stored("together", "held" if name in THREE else "every")
     prefix = f"{name}_"
     cells = cells_in(stored, prefix)
-    return {cell: result(stored, prefix + cell, cell) for cell in cells}
+    found = {cell: result(stored, prefix + cell, cell) for cell in cells}
+    floats, cast = centre_bills(together.problem(name))
+    for cell in CENTRES:
+        flooded = found.get(cell.replace("_centre", "_flood"))
+        if flooded is not None:
+            found[cell] = replace(flooded, cell=cell, floats=floats, cast=cast)
+    return found
+
+
+def centre_bills(p: Any) -> tuple[float, float]:
+    """Return the numbers that an agent sends in a step if one of them is the centre, by both bills.
+
+    Observations go to the root of the spanning tree, each with the number of its agent;
+    the estimate, a mean and a covariance, comes back along it.
+    """
+    # An observation crosses as many links as its agent is away from the root.
+    tree = together.spanning_tree(p.graph)
+    depth = np.zeros(p.n_agents)
+    for agent, parent in tree:
+        depth[agent] = depth[parent] + 1
+    present = np.ones((len(p.times), p.n_agents))
+    if p.silent is not None:
+        present = ~p.silent
+    # Every link on the way costs the observation's numbers and the agent's once.
+    numbers_up = (p.sensors[0].dim + 1) * float((present @ depth).mean())
+    d = len(p.scored)
+    estimate = d + d * (d + 1) // 2
+    # By broadcast an agent reaches all its children at once.
+    n_parents = len({parent for _, parent in tree})
+    by_link = numbers_up + estimate * len(tree)
+    by_broadcast = numbers_up + estimate * n_parents
+    return by_link / p.n_agents, by_broadcast / p.n_agents
 
 
 def cells_in(stored: Any, prefix: str) -> list[str]:
@@ -94,6 +140,7 @@ def ratio(one: Result, other: Result) -> Interval:
 def front(points: Mapping[str, tuple[float, float]]) -> list[str]:
     """Return the names of (cost, error) that no other beats in both, by rising cost."""
     names: list[str] = []
+    # By rising cost, and by rising error where costs are equal
     for name in sorted(points, key=lambda key: points[key]):
         if not names or points[name][1] < points[names[-1]][1]:
             names.append(name)
@@ -103,6 +150,7 @@ def front(points: Mapping[str, tuple[float, float]]) -> list[str]:
 def holm(p_values: Mapping[str, float], level: float = 0.05) -> set[str]:
     """Return the hypotheses that Holm's step-down procedure rejects at a familywise level."""
     rejected: set[str] = set()
+    # The k-th smallest p-value is compared with the level over what is left.
     for k, name in enumerate(sorted(p_values, key=lambda key: p_values[key])):
         if p_values[name] > level / (len(p_values) - k):
             break
@@ -126,15 +174,29 @@ def worse(best: Result, others: Iterable[Result]) -> set[str]:
 
 # ------------------------------------------------------------------------------------ operations
 
-FUSION_FACTORS = {"ci": 25, "trace": 2, "naive": 2, "info": 8}
+FUSION_FACTORS = {
+    "ci": 25,
+    "trace": 2,
+    "naive": 2,
+    "info": 8,
+    "inverted": 25,
+    "ellipsoid": 25,
+    "union": 250,
+    "channel": 8,
+}
 """Multiples of d³ for the fusion of one neighbour's belief, by rule."""
-SHARING_NEIGHBOURS = ("near", "ci", "trace", "pull")
+SHARING_NEIGHBOURS = (
+    *("near", "ci", "trace", "pull"),
+    *("diffuse", "inverted", "ellipsoid", "union"),
+)
 """Rules under which agents use the observations of their neighbours."""
 SIZES = {"pf": "particles", "ot": "transported"}
+SUMS = {"sum4": 4, "sum9": 9, "sum16": 16}
+"""Components of Gaussian sums."""
 
 
 def count_operations(p: Any, cell: str, members: int | None = None) -> float:
-    """Return the leading terms of an agent's floating-point operations in a step."""
+    """Return the leading terms of the busiest agent's floating-point operations in a step."""
     family = cell.split("_")[0]
     rule = cell.split("_")[-1]
     d = p.model.dim
@@ -142,13 +204,8 @@ def count_operations(p: Any, cell: str, members: int | None = None) -> float:
     m = count_observed(p, rule, near)
     transition = 400 if "chaotic" in p.traits else 2 * d * d
     fusing = FUSION_FACTORS.get(rule, 0) * (1 + near) * d**3
-    # Covariance forecast 4 d³, update 2 m d (d + m) + m³
-    if family in ("ekf", "ukf"):
-        rounds = {"two": 2, "meas": p.n_agents / 2}.get(rule, 0)
-        averaging = rounds * near * d * d
-        points = (2 * d + 1) * (transition + m * d) if family == "ukf" else 0
-        update = 2 * m * d * (d + m) + m**3
-        return 4 * d**3 + update + fusing + averaging + points
+    if family in ("ekf", "iekf", "ukf", *SUMS):
+        return count_kalman_operations(p, cell, m, transition) + fusing
     if family in ("news", "own"):
         return 10 * 6**3 + 4 * near * 4**3
     # Every pair of components is fused.
@@ -173,9 +230,34 @@ def count_observed(p: Any, rule: str, near: float) -> float:
     agents = 1.0
     if rule in SHARING_NEIGHBOURS:
         agents = 1 + near
-    elif rule == "flood":
+    elif rule == "hops":
+        hops = np.array([p.graph.hops(k) for k in range(p.n_agents)])
+        agents = float((hops <= 2).sum(axis=1).mean())
+    elif rule in ("flood", "centre"):
         agents = p.n_agents
     return agents * p.sensors[0].dim
+
+
+def count_kalman_operations(p: Any, cell: str, m: float, transition: float) -> float:
+    """Return the operations of a Kalman filter, or of a sum of them, without fusion."""
+    family = cell.split("_")[0]
+    rule = cell.split("_")[-1]
+    d = p.model.dim
+    near = float(p.graph.in_degree.mean())
+    # Covariance forecast 4 d³, update 2 m d (d + m) + m³
+    update = 2 * m * d * (d + m) + m**3
+    if family == "iekf":
+        return 4 * d**3 + 4 * update
+    if family in SUMS:
+        points = (2 * d + 1) * (transition + m * d)
+        return SUMS[family] * (4 * d**3 + update + points)
+    points = (2 * d + 1) * (transition + m * d) if family == "ukf" else 0
+    rounds = {"two": 2, "icf": 4, "hcmci": 8, "meas": p.n_agents / 2, "tree": 2}
+    averaging = rounds.get(rule, 0) * near * d * d
+    if rule in ("icf", "hcmci", "channel"):
+        # Priors in the form of information and back
+        averaging += 4 * d**3
+    return 4 * d**3 + update + averaging + points
 
 
 def count_ensemble_operations(
@@ -192,37 +274,11 @@ def count_ensemble_operations(
     return update
 
 
-# --------------------------------------------------------------------------------- decision tree
-
-QUESTIONS = ("plane", "doubted", "chaotic", "several", "curved", *BUDGETS)
-"""Traits of a problem that a user knows, and budgets that an agent may exceed.
-
-Where two questions divide the four problems alike the first one stands: the dimension
-comes before the curvature.
-"""
-
-
-def answer(question: Any, name: str, budget: float) -> bool:
-    """Return the answer to a question for a problem and a budget."""
-    if question == "plane":
-        return bool(together.problem(name).model.dim <= 2)
-    if isinstance(question, str):
-        return question in together.problem(name).traits
-    return budget > question
-
-
-@cache
-def regret(name: str, budget: float, cell: str) -> float:
-    """Return the log of a cell's error over the best consistent one's within the budget."""
-    candidate = results(name).get(cell)
-    if candidate is None or not candidate.consistent or candidate.floats > budget:
-        return np.inf
-    least = best(name, budget).error.mean()
-    return float(0.5 * np.log(candidate.error.mean() / least))
+# --------------------------------------------------------------------------- the best cells
 
 
 def admissible(name: str, budget: float = np.inf) -> list[Result]:
-    """Return the consistent cells within a budget."""
+    """Return the consistent cells within a budget of numbers, counted link by link."""
     return [
         r
         for cell, r in results(name).items()
@@ -234,49 +290,17 @@ def admissible(name: str, budget: float = np.inf) -> list[Result]:
 def best(name: str, budget: float = np.inf) -> Result:
     """Return the consistent cell of least error within a budget; of equal ones the cheapest."""
     candidates = admissible(name, budget)
+    # Cells whose errors differ by rounding alone are equal.
     least = min(r.error.mean() for r in candidates)
     equal = [r for r in candidates if r.error.mean() < least * (1 + 1e-4)]
     return min(equal, key=lambda r: r.floats)
 
 
-def best_leaf(rows: Sequence[Row]) -> tuple[float, str]:
-    """Return the least total regret on some rows, and its cell; infinite regrets count 10."""
-    costs = {}
-    for cell in together.CELLS:
-        costs[cell] = sum(min(regret(*row, cell), 10.0) for row in rows)
-    cell = min(costs, key=lambda name: (costs[name], name))
-    return costs[cell], cell
-
-
-def tree(rows: Sequence[Row], depth: int) -> tuple[float, Any]:
-    """Return the tree of limited depth that has the least regret on the rows."""
-    least: tuple[float, Any] = best_leaf(rows)
-    if depth == 0 or least[0] < 1e-9:
-        return least
-    # Split by the question that lowers the total regret most.
-    for question in QUESTIONS:
-        yes = tuple(row for row in rows if answer(question, *row))
-        no = tuple(row for row in rows if not answer(question, *row))
-        if not yes or not no:
-            continue
-        cost_yes, tree_yes = tree_once(yes, depth - 1)
-        cost_no, tree_no = tree_once(no, depth - 1)
-        cost = cost_yes + cost_no
-        # A question has to be worth a hundredth.
-        if cost < least[0] - 0.01:
-            least = cost, (question, tree_yes, tree_no)
-    return least
-
-
 @cache
-def tree_once(rows: tuple[Row, ...], depth: int) -> tuple[float, Any]:
-    """Return `tree`, computed once."""
-    return tree(rows, depth)
-
-
-def pick_cell(node: Any, name: str, budget: float) -> str:
-    """Return the cell that a tree picks."""
-    while isinstance(node, tuple):
-        question, yes, no = node
-        node = yes if answer(question, name, budget) else no
-    return str(node)
+def least_work(name: str, budget: float = np.inf) -> float:
+    """Return the least operations of a consistent cell within ten percent of the best one."""
+    p = together.problem(name)
+    # Ten percent of error are 1.1² of squared error.
+    limit = best(name, budget).error.mean() * 1.1**2
+    close = [r for r in admissible(name, budget) if r.error.mean() <= limit]
+    return min(count_operations(p, r.cell) for r in close)

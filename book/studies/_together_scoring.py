@@ -18,24 +18,31 @@ from _together_cells import CELLS, cell_names
 from _together_filters import GridFilter
 from _together_problems import (
     BATCH,
-    FOUR,
     STUDY,
-    THREE,
     TUNED,
     Data,
     Problem,
     problem,
 )
 
-from distfilt import metrics
-from distfilt.ensembles import sample_covariance
 from distfilt.filters import GaussianFilter, ParticleFilter
 
 Array = np.ndarray
 Seed = np.random.SeedSequence
 
 SCORES = ("error", "nees", "crps")
-UNCERTAIN = ("pf_", "ot_", "maps_", "ekf_", "reference", "half", "gm_")
+UNCERTAIN = (
+    "pf_",
+    "ot_",
+    "maps_",
+    "ekf_",
+    "reference",
+    "half",
+    "gm_",
+    "sum",
+    "ukf_",
+    "iekf",
+)
 """Beginnings of the columns in which a last bit may decide, as which particle is drawn."""
 
 
@@ -73,9 +80,11 @@ def score_filter(
 
     ``error`` is the mean squared error of the scored components, ``nees`` the NEES per
     component, ``crps`` their sum of CRPS; all are means over agents and over the times
-    after the burn-in. ``floats`` counts the numbers that an agent sends in a step. With
-    `one_by_one` the filter follows one run at a time.
+    after the burn-in. ``floats`` counts the numbers that an agent sends in a step, on
+    each link anew; ``cast`` counts them by broadcast, where all neighbours receive one
+    transmission. With `one_by_one` the filter follows one run at a time.
     """
+    # One run at a time for filters of the library that follow single runs.
     truth, observed = data
     runs = truth.shape[1]
     names = p.scored_truth(truth)
@@ -97,9 +106,11 @@ def score_filter(
         for name, values in mean_scores(p, run).items():
             collected[name].append(values)
     result = {name: np.ravel(values) for name, values in collected.items() if values}
-    # Numbers sent by one agent in one step
-    sent = run["scalars_total"].values[-1].sum() / p.n_agents / len(p.times)
-    return result | {"floats": float(sent)}
+    # Numbers sent by one agent in one step, by both bills
+    for key, name in (("floats", "scalars_total"), ("cast", "broadcast_scalars_total")):
+        sent = run[name].values[-1].sum()
+        result[key] = float(sent) / p.n_agents / len(p.times)
+    return result
 
 
 def mean_scores(p: Problem, run: Any) -> dict[str, Array]:
@@ -109,6 +120,7 @@ def mean_scores(p: Problem, run: Any) -> dict[str, Array]:
     means = late.mean(("time", "agent"), skipna=False)
     components = means.sel(component=list(p.scored))
     scores = {}
+    # The squared error is that of the whole position, or of the whole state.
     if "squared_error" in means:
         scores["error"] = components["squared_error"].sum("component").values
     if "nees" in means:
@@ -118,64 +130,42 @@ def mean_scores(p: Problem, run: Any) -> dict[str, Array]:
     return scores
 
 
-def log_scores(
-    p: Problem, f: Any, data: Data, rng: Any, *, local: bool = False
-) -> Array:
-    """Return minus the log-density of the truth, by each run's means and covariances.
+def best_value(errors: Array, nees: Array) -> int:
+    """Return which of some tried values the tuning keeps, by their mean scores.
 
-    Tuning minimizes it. Means over agents and over the times after the burn-in, of the
-    scored components; infinite where a filter fails or a cloud has no width.
+    The rule is that of the table of results: the least error of those whose NEES per
+    component is near one. A filter without such a value keeps that of least error.
     """
-    truth, observed = data
-    state = f.start(
-        prior_of(p, local),
-        runs=truth.shape[1:2],
-        rng=rng if f.requires_rng else None,
-    )
-    names = list(f.model.names)
-    indices = [names.index(name) for name in p.scored]
-    values = np.stack(list(p.scored_truth(truth).values()), axis=-1)
-    scores = []
-    for k, current in enumerate(f.steps(state, p.times, observed)):
-        if k < p.burn_in:
-            continue
-        summary = f.summarize(current)
-        cov = summary.covariance
-        if cov is None:
-            cov = sample_covariance(summary.members)
-        mean = summary.mean[..., indices]
-        cov = cov[..., indices, :][..., indices]
-        target = np.broadcast_to(values[k][:, None], mean.shape)
-        scores.append(gaussian_log_scores(mean, cov, target).mean(axis=-1))
-    return np.mean(scores, axis=0)
+    candidates = np.where(near_one(nees), errors, np.inf)
+    if not np.isfinite(candidates).any():
+        candidates = np.where(np.isfinite(errors), errors, np.inf)
+    # Of values that err alike, to a thousandth, the first.
+    return int(np.flatnonzero(candidates <= candidates.min() * 1.001)[0])
 
 
-def gaussian_log_scores(mean: Array, cov: Array, truth: Array) -> Array:
-    """Return log scores of Gaussians; infinite where one is not finite or has no width."""
-    usable = np.isfinite(mean).all(axis=-1) & np.isfinite(cov).all(axis=(-2, -1))
-    variance = np.diagonal(cov, axis1=-2, axis2=-1)
-    std = np.sqrt(np.where(usable[..., None], variance, 1.0))
-    usable &= (std > 0).all(axis=-1)
-    # The width is judged by the correlation matrix, whatever the units.
-    scale = std[usable][:, :, None] * std[usable][:, None, :]
-    correlation = cov[usable] / scale
-    usable[usable] = np.linalg.eigvalsh(correlation)[:, 0] > 1e-12
-    scores = np.full(usable.shape, np.inf)
-    scores[usable] = metrics.log_score(mean[usable], cov[usable], truth[usable])
-    return scores
+def near_one(nees: Array) -> Array:
+    """Return where a NEES per component counts as that of a consistent filter in tuning."""
+    low, high = STUDY["tuned_nees"]
+    return np.asarray((nees >= low) & (nees <= high))
+
+
+def values_that_count(errors: Array, nees: Array) -> set[int]:
+    """Return the values whose neighbours should be tried: the best one so far.
+
+    Where none is consistent, that whose NEES is nearest to one counts too.
+    """
+    # The best of those tried so far
+    counted = {best_value(errors, nees)}
+    if not near_one(nees).any():
+        with np.errstate(divide="ignore"):
+            counted.add(int(np.abs(np.log(nees)).argmin()))
+    return counted
 
 
 @cache
 def tuned_value(name: str, cell: str) -> float:
-    """Return a cell's tuned value for a problem; for one held out the upper median of the four."""
+    """Return a cell's tuned value for a problem."""
     table = {row["name"]: row["value"] for row in TUNED.tables.get("tuned", ())}
-    if name in THREE:
-        values = [
-            tuned_value(other, cell)
-            for other in FOUR
-            if not CELLS[cell].why_excluded(other)
-        ]
-        return sorted(values)[len(values) // 2] if values else 0.0
     default = 1.0 if CELLS[cell].option == "inflation" else 0.0
     return float(table.get(f"{name}_{cell}", default))
 
@@ -186,7 +176,8 @@ def tuned_value(name: str, cell: str) -> float:
 def score_columns(names: Iterable[str], runs: int = BATCH) -> list[str]:
     """Return the columns of some cells."""
     each = [f"{score}_{r}" for score in ("error", "nees") for r in range(runs)]
-    return [f"{name}_{key}" for name in names for key in ("floats", *each)]
+    keys = ("floats", "cast", *each)
+    return [f"{name}_{key}" for name in names for key in keys]
 
 
 def ill_conditioned_columns(names: Iterable[str]) -> list[str]:
@@ -207,8 +198,8 @@ def measure(
         except (ValueError, ArithmeticError, RuntimeError) as error:
             print(f"{p.name}, {name}: {error}", file=sys.stderr)
             nan = np.full(data[0].shape[1], np.nan)
-            scores = {"error": nan, "nees": nan, "floats": np.nan}
-    columns = {f"{name}_floats": scores["floats"]}
+            scores = {"error": nan, "nees": nan, "floats": np.nan, "cast": np.nan}
+    columns = {f"{name}_{key}": scores[key] for key in ("floats", "cast")}
     for key in ("error", "nees"):
         for r, value in enumerate(scores[key]):
             columns[f"{name}_{key}_{r}"] = value
@@ -252,6 +243,7 @@ def measure_references(
             if "half" in key
         }
         columns["grid_flood_floats"] = np.nan
+        columns["grid_flood_cast"] = np.nan
     return columns
 
 
@@ -268,13 +260,15 @@ def measure_cells(name: str, seed: Seed, cells: Iterable[str]) -> dict[str, floa
         columns |= measure(p, cell, f, data, seed)
     # Flooding sends the same numbers whatever the filter.
     if "ekf_flood_floats" in columns and p.model.dim == 2:
-        columns["grid_flood_floats"] = columns["ekf_flood_floats"]
+        for bill in ("floats", "cast"):
+            columns[f"grid_flood_{bill}"] = columns[f"ekf_flood_{bill}"]
     return columns
 
 
 def run_problem(name: str, seed: Seed) -> dict[str, float]:
     """Return the columns of the references and of all cells of a problem."""
     p = problem(name)
+    # The same data again for all cells
     columns = measure_references(p, seed, draw_data(p, seed))
     return columns | measure_cells(name, seed, cell_names(name))
 

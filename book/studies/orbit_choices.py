@@ -102,6 +102,7 @@ def run_row(
     for hour, values in zip(EARLY_HOURS, early, strict=True):
         for a in (0, 1):
             means[f"target{a + 1}_{hour}"] = float(values["error_tp"][a])
+            means[f"speed{a + 1}_{hour}"] = float(values["error_tv"][a])
     return means
 
 
@@ -128,7 +129,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     return {name: float(paper.SIX.format(v)) for name, v in metrics.items()}
 
 
-PARTS = ("target",)
+PARTS = ("target", "speed")
 METRICS = (
     *paper.ERRORS,
     "nees",

@@ -223,7 +223,8 @@ def run_damped(means: np.ndarray, observations: np.ndarray) -> list[np.ndarray]:
             full_step = condition(means, cov, gap, h, sensor.noise_cov)[0] - x
             for _ in range(HALVINGS):
                 after = value(x + full_step)
-                if not (worse := after > lowest_cost).any():
+                worse = after > lowest_cost
+                if not worse.any():
                     break
                 full_step[worse] /= 2
             # A step that never lowers the cost is not made.

@@ -16,9 +16,11 @@ import _together as together
 NAME = "every"
 PAPER = "together"
 CELLS = {
+    # The references first, then every cell that a problem has
     p: (*together.references(together.problem(p)), *together.cell_names(p))
     for p in together.FOUR
 }
+# A column for each run of each cell, and for both bills
 columns = together.score_columns(
     f"{p}_{c}" for p, cells in CELLS.items() for c in cells
 )
@@ -43,6 +45,7 @@ ill_conditioned = [
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """References and cells of the four problems."""
+    # Each problem has data of its own, the same for all filters.
     return {
         f"{p}_{k}": v for p in CELLS for k, v in together.run_problem(p, seed).items()
     }

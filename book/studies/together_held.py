@@ -13,6 +13,7 @@ import _together as together
 NAME = "held"
 PAPER = "together"
 CELLS = {p: ("reference", *together.cell_names(p)) for p in together.THREE}
+# A column for each run of each cell, and for both bills
 columns = together.score_columns(
     [f"{p}_{c}" for p, cells in CELLS.items() for c in cells]
 )
@@ -21,6 +22,7 @@ parameters = {
     "program": together.program_digest(),
     "cells": CELLS,
 }
+# Seeds of their own: these runs are in no other study.
 seeds = np.random.SeedSequence(together.STUDY["seed"] + 2).spawn(
     len(together.make_seeds())
 )
@@ -34,6 +36,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     metrics: dict[str, float] = {}
     for name in together.THREE:
         p = together.problem(name)
+        # The reference with half the effort serves the row of the grid alone.
         part = together.measure_references(p, seed, together.draw_data(p, seed))
         part |= together.measure_cells(name, seed, together.cell_names(name))
         metrics |= {

@@ -9,7 +9,6 @@ import importlib
 import inspect
 import io
 import json
-import math
 import re
 import types
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -890,12 +889,12 @@ def comparison_text() -> str:
 
     read = studies.script("_together_read")
     lines = [
-        "| Problem | Silent | At most 3 numbers | At most 32 numbers | Any |",
+        "| Problem | Silent | At most 2 numbers | At most 5 numbers | At most 20 numbers |",
         "|---|---|---|---|---|",
     ]
     for name in read.FOUR:
         cells = [f"*{name}*: {read.together.problem(name).scenario.title}"]
-        for budget in (0, 3, 32, math.inf):
+        for budget in (0, 2, 5, 20):
             # Among filters within the budget, only consistent ones compete.
             if not read.admissible(name, budget):
                 cells += ["no filter with a consistent covariance"]
@@ -903,7 +902,7 @@ def comparison_text() -> str:
             best = read.best(name, budget)
             # Errors are relative to the reference of the problem.
             error = read.ratio(best, read.results(name)["reference"]).estimate
-            cell = read.together.CELLS[best.cell]
+            cell = read.CELLS[best.cell]
             cells += [f"{error:.2f}: {cell.family}; {cell.exchange}"]
         lines += ["| " + " | ".join(cells) + " |"]
     return "\n".join(lines)

@@ -41,9 +41,10 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
 
     and the same for the vectors. As an average times A is a sum, all of them with ω = A are the
     Kalman filter of all observations if the averages are exact, whatever model and noise. They
-    differ after few rounds: "measurements" leaves forecasts apart, so that an agent may learn little
-    of components that its own sensors do not observe; "hybrid" with ω = 1 never counts information twice
-    (consensus on information); "weighted" is "hybrid" with ω = A for half of the numbers.
+    differ after few rounds: "measurements" leaves forecasts apart, so that an agent may learn
+    little of components that its own sensors do not observe; "hybrid" with ω = 1 never counts
+    information twice (consensus on information); "weighted" is "hybrid" with ω = A for half of the
+    numbers.
 
     Parameters
     ----------
@@ -168,7 +169,9 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
         """Return the Gaussians with information added; components may be known constants."""
         d = means.shape[-1]
 
-        def compute(m: Array, p: Array, numbers: Array, *_: object) -> tuple[Array, Array]:
+        def compute(
+            m: Array, p: Array, numbers: Array, *_: object
+        ) -> tuple[Array, Array]:
             j, v = unpack_information(numbers, d)
             # P⁺ = (I + P J)⁻¹ P and m⁺ = m + P⁺ (v - J m)
             new = symmetrise(np.asarray(np.linalg.solve(np.eye(d) + p @ j, p)))

@@ -12,8 +12,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment, linprog
@@ -174,8 +172,10 @@ def test_an_ensemble_without_far_members_is_solved_once(
     """The plan is that of one solution with the tie-breaker, to the bit."""
     solutions = []
 
-    def record(*arguments: Any) -> tuple[np.ndarray, np.ndarray]:
-        solutions.append(solve(*arguments))
+    def record(
+        cost: np.ndarray, a: np.ndarray, b: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        solutions.append(solve(cost, a, b))
         return solutions[-1]
 
     solve = solvers._solve_network

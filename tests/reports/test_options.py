@@ -113,6 +113,7 @@ BATCHED = {
 SHARING = {
     "share_observations": ({}, {"share_observations": False}),
     "exchange_interval": ({"lag": 3}, {"exchange_interval": 1.0}),
+    "hops": ({}, {"hops": "all"}),
 }
 SPLIT = {"split_threshold": 0.01, "max_components": 4, "n_components": 2}
 MIXTURE = {
@@ -153,6 +154,7 @@ CASES: dict[str, tuple[type[Any], dict[str, Any], dict[str, Any]]] = {
             **SHARING,
             "fusion": ({}, {"fusion": network.covariance_intersection}),
             "linearization": ({}, {"linearization": "unscented"}),
+            "iterations": ({}, {"iterations": 3}),
             "kappa": ({"linearization": "unscented"}, {"kappa": 3.0}),
             "inflation": ({}, {"inflation": 1.1}),
         },
