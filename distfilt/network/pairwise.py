@@ -89,6 +89,7 @@ def inverse_covariance_intersection(
     >>> fused[1].ravel().round(4)
     array([1., 1.])
     """
+    _warn_if_disconnected(channel, rounds)
     return _repeat_in_turn(
         belief, channel, rounds, partial(intersect_inverses, rule=rule)
     )
@@ -111,6 +112,7 @@ def ellipsoidal_intersection(
     >>> ellipsoidal_intersection(two, Channel(graphs.path(2)))[0].ravel()
     array([0., 0.])
     """
+    _warn_if_disconnected(channel, rounds)
     return _repeat_in_turn(belief, channel, rounds, intersect_ellipsoids)
 
 
@@ -134,6 +136,7 @@ def covariance_union(
     >>> covariance_union(two, Channel(graphs.path(2)))[1].ravel().round(6)
     array([5., 5.])
     """
+    _warn_if_disconnected(channel, rounds)
     return _repeat_in_turn(belief, channel, rounds, partial(unite_gaussians, rule=rule))
 
 
@@ -181,8 +184,7 @@ def split_covariance_intersection(
     >>> parts[0].ravel().round(6), parts[2].ravel().round(6)
     (array([1., 1.]), array([0.5, 0.5]))
     """
-    if rounds > 1:
-        _warn_if_disconnected(channel)
+    _warn_if_disconnected(channel, rounds)
     graph = channel.graph
     means, dependent, independent = belief
     d = means.shape[-1]
@@ -237,9 +239,6 @@ def _repeat_in_turn(
     belief: Pair, channel: Channel, rounds: int, pair_rule: PairRule
 ) -> Pair:
     """Exchange Gaussians some times, and fuse them two at a time."""
-    if rounds > 1:
-        _warn_if_disconnected(channel)
-
     def fuse(received: _Received) -> Pair:
         return _fuse_in_turn(received, pair_rule)
 

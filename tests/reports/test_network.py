@@ -62,6 +62,19 @@ RULES: dict[str, Callable[..., Any]] = {
         v, c, rounds=5, threshold=0.1
     ),
     "flooding": lambda v, c: network.flooding(v, c),
+    "inverse_covariance_intersection": lambda v, c: (
+        network.inverse_covariance_intersection(_gaussians(v), c, rounds=2)
+    ),
+    "ellipsoidal_intersection": lambda v, c: network.ellipsoidal_intersection(
+        _gaussians(v), c, rounds=2
+    ),
+    "covariance_union": lambda v, c: network.covariance_union(
+        _gaussians(v), c, rounds=2
+    ),
+    "information_consensus": lambda v, c: network.information_consensus(
+        _gaussians(v), c, rounds=2
+    ),
+    "diffuse_means": lambda v, c: network.diffuse_means(_gaussians(v), c, rounds=2),
 }
 """Every rule that does not refuse a graph in parts."""
 

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from distfilt import density, filters, network
-from distfilt.mixtures import target_fusion
+from distfilt.mixtures import split_gaussian, target_fusion
 from distfilt.models import Model, Swarm
-from distfilt.network import Faults, graphs
+from distfilt.network import Faults, Graph, graphs
 from distfilt.sensors import component, distance
 from distfilt.updates import enkf, enkf_exact
 from distfilt.updates.gaussian import exact_forecast
@@ -36,6 +36,7 @@ def bend(x: np.ndarray, t: float, dt: float) -> np.ndarray:
 
 MODEL = Model(2, bend, lambda t, dt: 0.05 * dt * np.eye(2))
 OTHER_MODEL = Model(2, bend, lambda t, dt: 0.5 * dt * np.eye(2))
+NOISY_MODEL = Model(2, bend, lambda t, dt: dt * np.eye(2))
 FAILING = Model(
     2,
     lambda x, t, dt: np.where(x > 50, np.nan, x),
@@ -48,6 +49,11 @@ OTHER_SENSORS = [component([0], std=0.5), distance([0, 1], std=0.1), None]
 def pull_to_average(beliefs: np.ndarray, channel: network.Channel) -> np.ndarray:
     """Move every agent's members towards the average of all, without messages."""
     return beliefs + 0.1 * (beliefs.mean(axis=-3, keepdims=True) - beliefs)
+
+
+def fail_in_one_run(beliefs: np.ndarray, channel: network.Channel) -> np.ndarray:
+    """Fail where the first run of several takes part, alone or with others."""
+    raise ValueError("beliefs must be finite numbers, got a rule that fails")
 
 
 def outcome(make: Callable[..., Any], options: dict[str, Any]) -> Any:
@@ -110,11 +116,28 @@ BATCHED = {
     "lag": ({}, {"lag": 2}),
     "record_evidence": ({}, {"record_evidence": True}),
 }
+BATCHED_ALONE = (
+    {"model": FAILING, "runs": (2,), "one_run_fails": True},
+    {"on_error": "keep"},
+)
 SHARING = {
     "share_observations": ({}, {"share_observations": False}),
     "exchange_interval": ({"lag": 3}, {"exchange_interval": 1.0}),
     "hops": ({}, {"hops": "all"}),
 }
+AVERAGE = partial(network.average_consensus, rounds=2)
+MIXED_PRIOR = split_gaussian(MEAN, COV, parts=3, axes=[0])
+
+
+def quadratic_basis(x: np.ndarray) -> np.ndarray:
+    """Polynomials of the first component up to the second degree."""
+    return filters.PolynomialBasis([0], degree=2)(x)
+
+
+# The outlier is nearer, so that the belief stays in the box.
+NEAR_SERIES = [[[1.0], [1.2], [7.0], [1.1]], *SERIES[1:]]
+CELLS = density.Grid((36, 36), low=-8.0, high=10.0)
+FINER_CELLS = density.Grid((45, 45), low=-8.0, high=10.0)
 SPLIT = {"split_threshold": 0.01, "max_components": 4, "n_components": 2}
 MIXTURE = {
     "target_dim": (
@@ -229,6 +252,91 @@ CASES: dict[str, tuple[type[Any], dict[str, Any], dict[str, Any]]] = {
             "target_dim": ({}, {"target_dim": 2}),
             "exchange_interval": ({}, {"exchange_interval": 1.0}),
             "shared_components": ({}, {"shared_components": [0]}),
+        },
+    ),
+    "channel": (
+        filters.ChannelFilter,
+        {**BASE},
+        {
+            **SHARED,
+            "graph": ({}, {"graph": Graph.from_edges(3, [(0, 2), (2, 1)])}),
+            "on_error": BATCHED_ALONE,
+            "record_evidence": ({}, {"record_evidence": True}),
+            "linearization": ({}, {"linearization": "unscented"}),
+            "kappa": ({"linearization": "unscented"}, {"kappa": 3.0}),
+            "inflation": ({}, {"inflation": 1.1}),
+        },
+    ),
+    "likelihood consensus": (
+        filters.LikelihoodConsensusFilter,
+        {
+            **BASE,
+            "members": 300,
+            "fusion": AVERAGE,
+            "basis": filters.PolynomialBasis([0, 1]),
+        },
+        {
+            **SHARED,
+            "faults": ({}, {"faults": Faults(loss=0.5, seed=1)}),
+            "on_error": BATCHED_ALONE,
+            "record_evidence": ({}, {"record_evidence": True}),
+            "lag": ({}, {"lag": 2}),
+            "fusion": ({}, {"fusion": network.finite_time_consensus}),
+            "members": ({}, {"members": 301}),
+            "ess_threshold": ({}, {"ess_threshold": 1.0}),
+            "jitter": ({}, {"jitter": 0.2}),
+            "basis": ({}, {"basis": quadratic_basis}),
+        },
+    ),
+    "grid": (
+        filters.GridFilter,
+        {**BASE, "grid": CELLS, "model": OTHER_MODEL, "series": NEAR_SERIES},
+        {
+            **SHARED,
+            "model": ({}, {"model": NOISY_MODEL}),
+            "on_error": (
+                {"runs": (2,), "prior": (MEAN, COV), "fusion": fail_in_one_run},
+                {"on_error": "keep"},
+            ),
+            "record_evidence": ({}, {"record_evidence": True}),
+            "share_observations": ({}, {"share_observations": False}),
+            "hops": ({}, {"hops": "all"}),
+            "fusion": ({}, {"fusion": AVERAGE}),
+            "fused": (
+                {"share_observations": False, "fusion": AVERAGE},
+                {"fused": "likelihoods"},
+            ),
+            "grid": ({}, {"grid": FINER_CELLS}),
+        },
+    ),
+    "information consensus": (
+        filters.InformationConsensusFilter,
+        {**BASE, "fusion": AVERAGE},
+        {
+            **SHARED,
+            "faults": ({}, {"faults": Faults(loss=0.5, seed=1)}),
+            "on_error": BATCHED_ALONE,
+            "record_evidence": ({}, {"record_evidence": True}),
+            "fusion": ({}, {"fusion": network.finite_time_consensus}),
+            "average": ({}, {"average": "hybrid"}),
+            "weight": ({"average": "hybrid"}, {"weight": 2.0}),
+            "linearization": ({}, {"linearization": "unscented"}),
+            "kappa": ({"linearization": "unscented"}, {"kappa": 3.0}),
+            "inflation": ({}, {"inflation": 1.1}),
+        },
+    ),
+    "sum": (
+        filters.GaussianSumFilter,
+        {**BASE, "prior": MIXED_PRIOR},
+        {
+            **SHARED,
+            "on_error": BATCHED_ALONE,
+            "record_evidence": ({}, {"record_evidence": True}),
+            "share_observations": ({}, {"share_observations": False}),
+            "hops": ({}, {"hops": "all"}),
+            "linearization": ({}, {"linearization": "unscented"}),
+            "kappa": ({"linearization": "unscented"}, {"kappa": 3.0}),
+            "inflation": ({}, {"inflation": 1.1}),
         },
     ),
     "density": (
