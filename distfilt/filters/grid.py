@@ -218,7 +218,7 @@ class GridFilter(
         columns = step.state.masses.reshape(-1, old.shape[-1]).T
         forecast = (matrix @ columns).T.reshape(old.shape)
         # Columns of the matrix sum to less than 1 near the sides of the box.
-        total = forecast.sum(axis=-1)
+        total = step.keep_failed(forecast.sum(axis=-1), 1.0)
         if (total < 0.99).any():
             step.warn_once(
                 "outside",

@@ -52,8 +52,11 @@ def pull_to_average(beliefs: np.ndarray, channel: network.Channel) -> np.ndarray
 
 
 def fail_in_one_run(beliefs: np.ndarray, channel: network.Channel) -> np.ndarray:
-    """Fail where the first run of several takes part, alone or with others."""
-    raise ValueError("beliefs must be finite numbers, got a rule that fails")
+    """Fail if the first agent of some run believes in a first component above 4."""
+    # Cells are counted along the second axis first: 36 for each value of the first.
+    if (beliefs[..., 0, :].argmax(axis=-1) > 24 * 36).any():
+        raise np.linalg.LinAlgError("a rule that fails")
+    return beliefs
 
 
 def outcome(make: Callable[..., Any], options: dict[str, Any]) -> Any:
@@ -136,6 +139,8 @@ def quadratic_basis(x: np.ndarray) -> np.ndarray:
 
 # The outlier is nearer, so that the belief stays in the box.
 NEAR_SERIES = [[[1.0], [1.2], [7.0], [1.1]], *SERIES[1:]]
+# Two runs, of which the first has observations of 6.
+SPLIT_SERIES = [np.array([[[6.0], [1.0]]] * 4), None, None]
 CELLS = density.Grid((36, 36), low=-8.0, high=10.0)
 FINER_CELLS = density.Grid((45, 45), low=-8.0, high=10.0)
 SPLIT = {"split_threshold": 0.01, "max_components": 4, "n_components": 2}
@@ -295,7 +300,7 @@ CASES: dict[str, tuple[type[Any], dict[str, Any], dict[str, Any]]] = {
             **SHARED,
             "model": ({}, {"model": NOISY_MODEL}),
             "on_error": (
-                {"runs": (2,), "prior": (MEAN, COV), "fusion": fail_in_one_run},
+                {"runs": (2,), "series": SPLIT_SERIES, "fusion": fail_in_one_run},
                 {"on_error": "keep"},
             ),
             "record_evidence": ({}, {"record_evidence": True}),
