@@ -342,6 +342,28 @@ def api_parts() -> dict[str, list[str]]:
     return {part: parts[part] for part in order}
 
 
+FAMILIES = (
+    "gaussian",
+    "ensemble",
+    "particle",
+    "mixture",
+    "increments",
+    "density",
+    "sum",
+    "grid",
+    "consensus",
+    "likelihood",
+    "tree",
+)
+"""Modules of `distfilt.filters` on a page of their own, since all of them are long for one."""
+
+
+def is_family(name: str) -> bool:
+    """Whether a module stands on the page of the families of filters."""
+    head, _, module = name.rpartition(".")
+    return head == "distfilt.filters" and module in FAMILIES
+
+
 def anchor(name: str) -> str:
     """Return the label of a module's section."""
     return "api-" + name.replace(".", "-").replace("_", "-")
@@ -498,11 +520,28 @@ def api_index() -> str:
     return "\n".join(lines)
 
 
+def api_families(by: dict[str, list[str]]) -> str:
+    """Return the reference of the families of filters, which belong to `distfilt.filters`."""
+    names = [f"distfilt.filters.{module}" for module in FAMILIES]
+    lines = [
+        "# Families of filters",
+        "",
+        "The rest of `distfilt.filters` is on [its own page](/book/api/filters.md).",
+        "",
+    ]
+    return "\n".join([*lines, *api_sections("distfilt.filters", names, by)])
+
+
 def api_part(part: str, by: dict[str, list[str]]) -> str:
     """Return the reference of one part, module by module."""
+    names = [name for name in api_parts()[part] if not is_family(name)]
+    return "\n".join(api_sections(f"distfilt.{part}", names, by))
+
+
+def api_sections(head: str, names: list[str], by: dict[str, list[str]]) -> list[str]:
+    """Return the lines of a section for each module."""
     lines = []
-    head = f"distfilt.{part}"
-    for name in api_parts()[part]:
+    for name in names:
         module = importlib.import_module(name)
         documented = [n for n in module.__all__ if home_of(module, n) == name]
         # Protocols are documented, although users need not import them.
@@ -520,7 +559,7 @@ def api_part(part: str, by: dict[str, list[str]]) -> str:
         lines += ["```{eval-rst}", *body, "```", ""]
         if name == head and hasattr(module, "__path__"):
             lines += [f"From here a reader imports {links(module)}.", ""]
-    return "\n".join(lines)
+    return lines
 
 
 def cell(text: str) -> str:
@@ -912,6 +951,7 @@ def write_generated(folder: Path) -> None:
     """Write the included parts of pages; an unchanged part keeps its date."""
     by = users()
     parts = {f"api/{part}.md": api_part(part, by) for part in api_parts()}
+    parts["api/families.md"] = api_families(by)
     parts["api.md"] = api_index()
     parts["map.md"] = map_text()
     parts["errata.md"] = errata_text()
