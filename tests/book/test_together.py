@@ -128,7 +128,7 @@ def test_held_out_problems_have_tuned_values_of_their_own() -> None:
 def test_the_iterated_filter_is_the_library_s() -> None:
     problem = together.problem("range")
     _, observations = problem.simulate(3, np.random.default_rng(5))
-    options = {"hops": "all", "inflation": 1.1}
+    options: dict[str, Any] = {"hops": "all", "inflation": 1.1}
     args = problem.model, problem.sensors, problem.graph
     ours = together.IteratedGaussian(*args, iterations=4, **options)
     theirs = GaussianFilter(*args, iterations=4, **options)
