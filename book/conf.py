@@ -135,7 +135,7 @@ nitpicky = True
 OUTSIDE = (
     r"(np|numpy|scipy|xr|xarray|collections|typing|types|functools|pathlib|os|random)\..*",
     r"Any|Array(Like)?|NDArray|Callable|Generator|Hashable|I?ter\w+|Literal|Mapping|Path|Sequence",
-    r"S|T|P|R|Gaussians|ellipsis|AnyState|ShapeNames|Dataset|DataArray|Protocol|PathLike|cs[cr]_array|dtype|module|F|Self|.*\.F|-?\d.*",
+    r"S|T|P|R|_OnePrior|Gaussians|ellipsis|AnyState|ShapeNames|Dataset|DataArray|Protocol|PathLike|cs[cr]_array|dtype|module|F|Self|.*\.F|-?\d.*",
 )
 nitpick_ignore_regex = [("py:.*", "|".join(OUTSIDE))]
 

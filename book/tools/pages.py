@@ -332,7 +332,8 @@ def api_parts() -> dict[str, list[str]]:
     """Return the library's parts in the order of the page, each with its modules."""
     parts: dict[str, list[str]] = {}
     for name in modules():
-        if name != "distfilt":
+        # A module without public names has no section.
+        if name != "distfilt" and importlib.import_module(name).__all__:
             # The part is the subpackage: distfilt.PART.module
             parts.setdefault(name.split(".")[1], []).append(name)
     order = [

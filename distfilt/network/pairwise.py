@@ -239,6 +239,7 @@ def _repeat_in_turn(
     belief: Pair, channel: Channel, rounds: int, pair_rule: PairRule
 ) -> Pair:
     """Exchange Gaussians some times, and fuse them two at a time."""
+
     def fuse(received: _Received) -> Pair:
         return _fuse_in_turn(received, pair_rule)
 

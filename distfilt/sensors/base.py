@@ -17,6 +17,7 @@ from functools import cached_property, partial
 from typing import Annotated, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..derivatives import difference_with_error, evaluate_derivative
 from ..linalg import broadcast_leading, factor
@@ -183,7 +184,7 @@ class Sensor(FrozenModel):
         return bool(self.periods) or self.residual_function is not None
 
     @cached_property
-    def half_periods(self) -> Array | None:
+    def half_periods(self) -> NDArray[np.float64] | None:
         """Half of each component's period, infinity without one; None without `periods`."""
         if not self.periods:
             return None

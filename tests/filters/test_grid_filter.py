@@ -161,9 +161,14 @@ def test_averaged_likelihoods_are_all_observations() -> None:
     # A distance and a bearing among them, whose likelihoods are not Gaussian.
     seen: list[Any] = [[0.8], [1.1], [0.4], [0.2], None]
     f = GridFilter(
-        WIDE, sensors, NET, grid=BOX, share_observations=False, fused="likelihoods",
+        WIDE,
+        sensors,
+        NET,
+        grid=BOX,
+        share_observations=False,
+        fused="likelihoods",
         fusion=finite_time_consensus,
-    )  # fmt: skip
+    )
     g = GridFilter(WIDE, sensors, NET, grid=BOX, hops="all")
     a = f.step(f.start(PRIOR), 1.0, seen)
     b = g.step(g.start(PRIOR), 1.0, seen)
@@ -176,15 +181,22 @@ def test_averaged_beliefs_are_geometric_means() -> None:
     """Of Gaussian beliefs covariance intersection with the same weights."""
     sensors = [component([0], std=0.5), component([1], std=0.5)]
     f = GridFilter(
-        still_model(2), sensors, graphs.path(2), grid=BOX, share_observations=False,
+        still_model(2),
+        sensors,
+        graphs.path(2),
+        grid=BOX,
+        share_observations=False,
         fusion=average_consensus,
-    )  # fmt: skip
+    )
     from distfilt.filters import GaussianFilter
 
     g = GaussianFilter(
-        still_model(2), sensors, graphs.path(2), share_observations=False,
+        still_model(2),
+        sensors,
+        graphs.path(2),
+        share_observations=False,
         fusion=covariance_intersection,
-    )  # fmt: skip
+    )
     seen = [[0.8], [-0.3]]
     a = f.summarize(f.step(f.start(PRIOR), 0.0, seen))
     b = g.summarize(g.step(g.start(PRIOR), 0.0, seen))
@@ -224,9 +236,11 @@ def test_runs_gates_losses_and_files(tmp_path: Any) -> None:
 
 def test_a_run_in_which_nothing_is_possible_fails_alone() -> None:
     f = GridFilter(
-        still_model(1), [Sensor(1, lambda x: np.where(x > 0, 1.0, np.nan), [[1e-3]])],
-        grid=LINE, on_error="keep",
-    )  # fmt: skip
+        still_model(1),
+        [Sensor(1, lambda x: np.where(x > 0, 1.0, np.nan), [[1e-3]])],
+        grid=LINE,
+        on_error="keep",
+    )
     # In the second run the value is beyond every cell's prediction.
     state = f.start(([0.0], [[1.0]]), runs=(2,))
     with np.errstate(over="ignore"):

@@ -146,8 +146,12 @@ def test_particles_that_contradict_an_observation_have_little_weight() -> None:
     """A likelihood of zero counts as the least of all others, and leaves the fit finite."""
     root = Sensor(1, lambda x: np.where(x > 0, x, np.nan), [[0.5]])
     sensors = [root] + [None] * 4
-    f = make(LikelihoodConsensusFilter, sensors=sensors, basis=PolynomialBasis([0]),
-             model=still_model(1, 0.1))  # fmt: skip
+    f = make(
+        LikelihoodConsensusFilter,
+        sensors=sensors,
+        basis=PolynomialBasis([0]),
+        model=still_model(1, 0.1),
+    )
     state = f.start(([0.5], [[1.0]]), rng=default_rng(0))
     state = f.step(state, 1.0, [[1.0], None, None, None, None])
     assert np.isfinite(state.log_weights).all()
@@ -162,9 +166,11 @@ def test_gate_losses_runs_and_failures() -> None:
     seen[0][2, 1] += 80.0
     rule = partial(average_consensus, rounds=20)
     f = make(
-        LikelihoodConsensusFilter, fusion=rule, gate_probability=0.9999,
+        LikelihoodConsensusFilter,
+        fusion=rule,
+        gate_probability=0.9999,
         faults=Faults(loss=0.1, seed=2),
-    )  # fmt: skip
+    )
     state = f.start(PRIOR, rng=default_rng(3), runs=(3,))
     rejected = 0.0
     for k, t in enumerate(TIMES):
@@ -177,9 +183,13 @@ def test_gate_losses_runs_and_failures() -> None:
 def test_without_links_agents_use_their_own() -> None:
     _, seen = data(team())
     f = LikelihoodConsensusFilter(
-        model(), team(), lambda t: np.zeros((5, 5)), basis=QUADRATIC,
-        fusion=finite_time_consensus, members=400,
-    )  # fmt: skip
+        model(),
+        team(),
+        lambda t: np.zeros((5, 5)),
+        basis=QUADRATIC,
+        fusion=finite_time_consensus,
+        members=400,
+    )
     g = make(ParticleFilter, hops=1, share_observations=False)
     assert (last_of(f, seen).log_weights == last_of(g, seen).log_weights).all()
 

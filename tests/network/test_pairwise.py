@@ -176,9 +176,14 @@ def test_split_intersection_bounds_the_error_for_any_correlation(omega: float) -
 
     def rule(mean_a: Array, _: Array, mean_b: Array, __: Array) -> tuple[Array, Array]:
         mean, part, rest = pure.intersect_split(
-            mean_a, dependent[0], independent[0],
-            mean_b, dependent[1], independent[1], omega=omega,
-        )  # fmt: skip
+            mean_a,
+            dependent[0],
+            independent[0],
+            mean_b,
+            dependent[1],
+            independent[1],
+            omega=omega,
+        )
         return mean, part + rest
 
     roots = [np.linalg.cholesky(d) for d in dependent]
@@ -191,9 +196,14 @@ def test_split_intersection_bounds_the_error_for_any_correlation(omega: float) -
     # The independent part is that of the gains.
     k, g, _ = gains(rule, *total)
     *_, rest = pure.intersect_split(
-        np.zeros(3), dependent[0], independent[0],
-        np.zeros(3), dependent[1], independent[1], omega=omega,
-    )  # fmt: skip
+        np.zeros(3),
+        dependent[0],
+        independent[0],
+        np.zeros(3),
+        dependent[1],
+        independent[1],
+        omega=omega,
+    )
     expected = k @ independent[0] @ k.mT + g @ independent[1] @ g.mT
     assert np.allclose(rest, expected, rtol=1e-6)
 
