@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from distfilt.filters import GaussianFilter
+from distfilt.kalman import kalman_filter
 from distfilt.models import Model
 from distfilt.network import graphs
 from distfilt.sensors import component
@@ -122,3 +123,67 @@ def test_robots_are_tracked_from_a_log_of_events(
     error, _, _, floats = rows["increment"]
     assert error < 1.25 * rows["gaussian"][0]
     assert floats < rows["gaussian"][3]
+
+
+def test_recipes_agree_with_values_from_elsewhere(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    # The script compares each with a value by hand; these come from other methods.
+    names = run("streams")
+    rows = table("recipe values\n" + capsys.readouterr().out)
+    # The delayed observation, assimilated in the order of time.
+    f = GaussianFilter(names["WALK"], [component([0], std=1.0)])
+    in_order = f.run(
+        f.start(names["PRIOR"]), [1.4, 2.0, 3.0], [[[0.5], [1.0], [np.nan]]]
+    )
+    mean = in_order["mean"].values[-1, 0]
+    assert np.allclose(rows["delayed_observation"], mean, atol=5e-4)
+    # A robot at 3 ± 2 that is measured at 3.5 ± 1, and a landmark 5 ± 0.1 ahead.
+    assert rows["first_sight"] == [3.4, 8.4, 0.8, 0.81]
+    # Both observations of (place, first bias, second bias), in one linear regression.
+    design = np.array([[1.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
+    information = np.diag([1.0, 1.0, 4.0]) + design.T @ design
+    place, *_ = np.linalg.solve(information, design.T @ np.ones(2))
+    assert np.allclose(rows["restart"], place, atol=5e-4)
+    assert rows["priors_of_agents"] == [1.667, 2.8]
+    # The Kalman filter of matrices, with the same three steps.
+    ends = np.array([0.0, 0.3, 1.0, 2.0])
+    steps = np.exp(-np.diff(ends**2) / 2).reshape(3, 1, 1)
+    one = np.eye(1)
+    y = np.array([[np.nan], [np.nan], [0.5]])
+    exact = kalman_filter([1.0], one, y, F=steps, H=one, Q=0 * one, R=one)
+    assert np.allclose(rows["matrix_of_time"], exact.means[-1], atol=5e-4)
+    assert rows["known_constant"] == [4.3, 2.0, 0.333, 0.0]
+    # Samples of the robot's drive: the linear covariance is that for small errors.
+    rng = np.random.default_rng(0)
+    speeds, turns = rng.normal(size=(2, 100_000, 2)) * [[[0.2]], [[0.1]]]
+    headings = np.stack([turns[:, 0] / 2, turns[:, 0] + turns[:, 1] / 2], axis=-1)
+    across = ((1 + speeds) * np.sin(headings)).sum(axis=-1).var()
+    along = ((1 + speeds) * np.cos(headings)).sum(axis=-1).var()
+    sampled = [across, along, turns.sum(axis=-1).var()]
+    assert np.allclose(rows["odometry"], sampled, rtol=0.05)
+    # The gamma distribution is conjugate to counts; Student's t resists the outlier.
+    counts, student, radar = rows["likelihoods"]
+    assert abs(counts - 25 / 5) < 0.02
+    assert student < 5 < radar < 6
+    # The evidence by the chain rule, one scalar Kalman filter.
+    assert np.allclose(
+        rows["evidence"], chain_rule([1, 1, 2], [0.2, 1.1, -0.9]), atol=5e-4
+    )
+
+
+def chain_rule(steps: list[float], observed: list[float]) -> tuple[float, float]:
+    """Return log-evidence and NIS of a random walk from N(0, 1), observed with unit noise."""
+    mean = 0.0
+    variance = 1.0
+    log_evidence = 0.0
+    nis = 0.0
+    for dt, y in zip(steps, observed, strict=True):
+        variance += dt
+        s = variance + 1.0
+        square = (y - mean) ** 2 / s
+        log_evidence -= (square + np.log(2 * np.pi * s)) / 2
+        nis += square
+        mean += variance / s * (y - mean)
+        variance /= s
+    return log_evidence, nis

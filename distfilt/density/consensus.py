@@ -175,7 +175,8 @@ class DynamicAverage(FrozenModel, ConsensusProtocol):
     """First-order dynamic average consensus on cosine coefficients of the density.
 
     Metropolis weights if all links are bidirectional, otherwise weights that balance the graph
-    (M. Zhu and S. Martinez, Automatica 46 (2010) 322-329).
+    (M. Zhu and S. Martinez, Automatica 46 (2010) 322-329). On one-way links, losses move the
+    average.
 
     Parameters
     ----------
@@ -198,7 +199,7 @@ class DynamicAverage(FrozenModel, ConsensusProtocol):
     def update(
         self, memory: Memory, snapshot: SwarmSnapshot, channel: Channel, dt: float
     ) -> Update:
-        """Mix the estimates, and add the change of each agent's input."""
+        """Mix the estimates, and add the change of each agent's input, its encoded kernel."""
         estimates, previous = memory
         inputs = _encode(snapshot, self.modes, snapshot.kernels)
         graph = channel.graph
@@ -206,10 +207,11 @@ class DynamicAverage(FrozenModel, ConsensusProtocol):
             weights = weighting.doubly_stochastic(graph)
         else:
             weights = weighting.metropolis(graph)
-        # A lost message must not change the sum of the estimates.
+        # With links both ways a lost message cancels its answer too, which keeps the sum of the
+        # estimates. One-way links cannot: the receiver keeps its own value, and the sum moves.
         on_loss: LossRule = "keep" if graph.is_directed else "mutual"
-        # x ← W x + (u - u_previous) conserves mean(x) = mean(u).
+        # x ← W x + (u - u_previous) conserves mean(x) = mean(u), as the columns of W sum to one.
         mixed = channel.mix(estimates, weights, on_loss=on_loss)
         estimates = mixed + (inputs - previous)
-        densities, agents = _decode(estimates, snapshot, self.modes)
-        return (estimates, inputs), densities, agents
+        densities, n_agents = _decode(estimates, snapshot, self.modes)
+        return (estimates, inputs), densities, n_agents

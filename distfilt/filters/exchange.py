@@ -87,14 +87,17 @@ def _choose_outgoing(
 ) -> list[list[Observation]]:
     """Choose each agent's messages of this step: nothing, or its new and its pending observations.
 
-    Without a channel at this time, the observations wait in ``step.pending`` for the next one.
+    Without a channel at this time, the observations wait in ``step.pending`` for the next one, if
+    the filter has a lag; otherwise they are never sent.
     """
     f = step.filter
     if not f.share_observations or f.graph is None:
         return []
     waiting = cast(SensorState, step.state).pending
     if step.channel is None:
+        # Only a filter with a lag can assimilate an observation later, at its own time.
         if f.lag:
+            # A change since the sensor's last observation cannot wait.
             _refuse_waiting_changes(step, observed)
             # Copies, since the user's array may change before it is sent.
             new = [
@@ -104,7 +107,8 @@ def _choose_outgoing(
             ]
             step.pending = (*waiting, *new)
         return []
-    # First the pending observations, which the receivers assimilate at their stored times.
+    # First the pending observations, which the receivers assimilate at their stored times. All
+    # leave now: ``step.pending`` stays empty.
     outgoing: list[list[Observation]] = [[] for _ in observed]
     for observation in waiting:
         if observation.t not in step.times:

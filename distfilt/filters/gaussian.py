@@ -293,12 +293,14 @@ class GaussianFamily(
     ) -> tuple[Array, Array, Array | None]:
         """Return value, slope and extra covariance, if any, of a function of a Gaussian.
 
-        ``jacobian(mean, cov)`` is the derivative at the mean (..., d).
+        ``jacobian(mean, cov)`` is the derivative at the mean (..., d); finite differences take
+        their step from the covariance.
         """
         if is_linear or self.linearization == "extended":
             # For a linear function unscented points would give the same.
             value = function(mean[..., None, :])[..., 0, :]
             return value, jacobian(mean, cov), None
+        # P = L Lᵀ; the divisor is L, with ones in place of zeros on its diagonal.
         root, divisor = _factor_covariance(cov)
         d = mean.shape[-1]
         points, weights = unscented_points(mean, root, kappa=self.kappa)
@@ -306,7 +308,7 @@ class GaussianFamily(
         value = weights @ values
         anomalies = values - value[..., None, :]
         # Opposite points lie ±√(d+κ) columns of the root L from the mean, so that half their
-        # differences are (H L)ᵀ √(d+κ) and H follows by a triangular solve.
+        # differences are (H L)ᵀ √(d+κ) and H follows by a triangular solve, Lᵀ Hᵀ = (H L)ᵀ.
         ahead = values[..., 1 : d + 1, :]
         behind = values[..., d + 1 :, :]
         scaled_slope = (ahead - behind) / (2 * np.sqrt(d + self.kappa))

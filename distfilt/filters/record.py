@@ -364,7 +364,11 @@ def _read_components(
 def _score(
     summary: Summary, truth: Array, components: Components, scores: Collection[Score]
 ) -> dict[str, Array]:
-    """Return the scores of a summary in the components that are known."""
+    """Return the scores of a summary in the components whose truth is given, by their index.
+
+    A belief is scored if its mean and the truth are finite in all of them; otherwise crps and nees
+    are NaN.
+    """
     result: dict[str, Array] = {}
     mean = summary.mean
     truth = np.broadcast_to(truth, mean.shape)
@@ -373,7 +377,7 @@ def _score(
     is_finite = np.isfinite(known_mean) & np.isfinite(known_truth)
     is_scored = np.asarray(is_finite.all(axis=-1))
     if "squared_error" in scores:
-        # Component by component; the total leaves out the unknown ones.
+        # Component by component, NaN without a truth; the total leaves those out.
         squared = (mean - truth) ** 2
         result["squared_error"] = squared
         result["total_squared_error"] = squared[..., components].sum(axis=-1)

@@ -747,7 +747,10 @@ class Received:
     ) -> tuple[Array, Array]:
         """Return moments of the predictions with those of likelihood sensors put in.
 
-        Unless they are required, the numbers of a sensor without moments are NaN.
+        These are sums over the members `states` (*runs, G, N, d) with `weights` (*runs, G, N), in
+        the sensors' places of `mean` (*runs, G, M) and `cov` (*runs, G, M, M). A sensor without
+        moments is an error if they are required, as for a gate; otherwise its mean is NaN, so that
+        its observations count as missing.
         """
         mean = mean.copy()
         cov = cov.copy()

@@ -188,12 +188,13 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
     def _forecast_components(self, step: Step[Any]) -> tuple[Array, Array]:
         """Return the components' forecasts, (*runs, A, L, ...)."""
         state = step.state
-        # Components stand among the runs, before the agents.
+        # A bank of Gaussian filters: the components stand among the runs, (*runs, L, A, ...). Its
+        # state holds nothing to draw with and, jointly with the present, no earlier states.
         bank = copy(step)
         bank.state = GaussianState.construct(
             state.t,
             state.ledger,
-            None,
+            rng=None,
             joint_means=state.component_means.swapaxes(-3, -2),
             joint_covariances=state.component_covariances.swapaxes(-4, -3),
             dim=state.dim,

@@ -303,9 +303,11 @@ class LinearModel(Model):
         return self._compute_noise(t, dt)
 
     def _compute_noise(self, t: float, dt: float) -> tuple[Array, Array]:
+        """Compute what `_noise` returns, Q and L with Q = L Lᵀ; once, check Φ against Q."""
         cov, lower = super()._noise(t, dt)
         if dt and is_first_use(self, "transition_matrix"):
-            # The check asks for half steps, at which a user's table may have no entry.
+            # The check calls the user's functions for half steps, at which they may fail, as a
+            # table without such an entry does: then nothing is checked.
             with suppress(
                 AssertionError, LookupError, RuntimeError, TypeError, ValueError
             ):
@@ -314,7 +316,7 @@ class LinearModel(Model):
                         "transition_matrix must lead from x(t) to x(t + dt), but only its "
                         "transpose fits noise_cov: return the transposed matrix",
                         RuntimeWarning,
-                        4,
+                        stacklevel=4,
                     )
         return cov, lower
 
