@@ -594,8 +594,9 @@ class SensorFilter(Filter[S]):
             return
         if not self.supports_likelihoods:
             raise ValueError(
-                "sensors must have Gaussian noise here, got a LikelihoodSensor: use a "
-                f"ParticleFilter or a TransportFilter in place of a {type(self).__name__}"
+                f"sensors must have Gaussian noise in {type(self).__name__}, got a "
+                "LikelihoodSensor: use ParticleFilter, TransportFilter, GridFilter or "
+                "LikelihoodConsensusFilter"
             )
         if self.gate_probability is not None and sensor.moments is None:
             raise ValueError(

@@ -15,9 +15,10 @@ from ..network.information import (
     unpack_information,
 )
 from ..periods import fold
-from ..validation import Array, PositiveFloat
+from ..validation import Array, PositiveFloat, Rng
 from .gaussian import GaussianFamily, GaussianState
 from .options import FusesBeliefs
+from .priors import Prior, moments_by_agent
 from .step import Received, Step
 
 __all__ = ["InformationConsensusFilter"]
@@ -106,6 +107,14 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
                 "weight must be None for the average 'weighted', which has none, got "
                 f"{self.weight:g}"
             )
+
+    def initial_state(
+        self, prior: Prior, runs: tuple[int, ...], rng: Rng | None
+    ) -> dict[str, object]:
+        """Return the prior for the agents; where all information is averaged, it is definite."""
+        if self.average != "measurements":
+            moments_by_agent(prior, self.model.dim, self.n_agents, "definite")
+        return super().initial_state(prior, runs, rng)
 
     def next_state(self, step: Step[GaussianState]) -> GaussianState:
         """Forecast, average the information, add it."""

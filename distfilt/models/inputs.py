@@ -52,7 +52,7 @@ class Inputs(FrozenModel):
     """
 
     times: Times
-    values: Annotated[Array, "T k"]
+    values: Annotated[ArrayInput, "T k"]
     cov: Annotated[PositiveSemidefinite, "k k"]
 
     def __post_init__(self) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from distfilt.filters import GaussianFilter, InformationConsensusFilter
+from distfilt.models import Model
 from distfilt.network import (
     Channel,
     Faults,
@@ -356,3 +357,24 @@ def test_what_is_refused() -> None:
         consensus_filter(naive_fusion)
     with pytest.raises(ValueError, match="^weight must be None for the average"):
         consensus_filter(average_consensus, weight=2.0)
+
+
+def test_a_known_constant_is_refused_where_all_information_is_averaged() -> None:
+    rest = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
+    prior = (np.zeros(2), np.diag([1.0, 0.0]))
+    sensors = [component([0], std=1.0)] * 2
+    options: dict[str, Any] = {"fusion": finite_time_consensus}
+    for average in ("weighted", "hybrid"):
+        f = InformationConsensusFilter(
+            rest, sensors, graphs.path(2), average=average, **options
+        )
+        with pytest.raises(ValueError, match="got the variance 0 of component 1"):
+            f.start(prior)
+    # Both observations: P = 1 / (1 + 2), and the constant stays what it is.
+    f = InformationConsensusFilter(
+        rest, sensors, graphs.path(2), average="measurements", **options
+    )
+    state = f.step(f.start(prior), 0.0, [[3.0], [3.0]])
+    assert np.allclose(state.means, [2.0, 0.0])
+    assert np.allclose(state.covariances[:, 0, 0], 1 / 3)
+    assert (state.covariances[:, 1] == 0).all()

@@ -203,12 +203,12 @@ def test_particles_that_make_a_count_impossible_lose_their_weight() -> None:
     ],
 )
 def test_families_of_gaussian_noise_refuse_it_by_name(make: Any) -> None:
-    with pytest.raises(ValueError, match="sensors must have Gaussian noise here"):
+    with pytest.raises(ValueError, match="sensors must have Gaussian noise in"):
         make(STILL, [COUNTER])
     # Also where it comes with an observation.
     f = make(STILL, [component([0], std=1.0)])
     start = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
-    with pytest.raises(ValueError, match="sensors must have Gaussian noise here"):
+    with pytest.raises(ValueError, match="sensors must have Gaussian noise in"):
         f.step(start, 0.0, [[Observation(0.0, 0, [1.0], COUNTER)]])
 
 
