@@ -1,0 +1,176 @@
+"""Wrong results of pasts, gates, tapers and ties that the tests once let pass.
+
+All of them are of our own making (source: own): they are found by changing one line of the code
+and looking whether a test fails. Each test has a value of its own, by hand or from theory.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from distfilt import density, network
+from distfilt.filters import (
+    EnsembleFilter,
+    GaussianFilter,
+    GaussianSumFilter,
+    InformationConsensusFilter,
+    ParticleFilter,
+)
+from distfilt.mixtures import GaussianMixture
+from distfilt.models import Model
+from distfilt.network import graphs
+from distfilt.sensors import Sensor, component, wrap
+from distfilt.updates import etkf, with_localization
+from distfilt.updates.wrappers import gaspari_cohn
+
+TURN = 2 * np.pi
+STILL = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+PAST_FILTERS = {
+    "gaussian": partial(
+        GaussianFilter, fusion=partial(network.covariance_intersection, rule="equal")
+    ),
+    "ensemble": partial(
+        EnsembleFilter,
+        members=4000,
+        fusion=partial(network.intersect_ensembles, rule="equal"),
+    ),
+}
+
+
+@pytest.mark.parametrize("family", PAST_FILTERS)
+def test_the_past_of_fused_headings_turns_with_them(family: str) -> None:
+    """Agents at θ ± 0.1 fuse to θ, and their past follows halfway, also where θ is at the cut."""
+    walk = Model(
+        1, lambda x, t, dt: x, lambda t, dt: 0.04 * dt * np.eye(1), periods=(TURN,)
+    )
+    f: Any = PAST_FILTERS[family](walk, [None, None], graphs.path(2), lag=1)
+    pasts = []
+    for centre in (0.5, np.pi):
+        prior = [(wrap([centre + side]), [[0.04]]) for side in (-0.1, 0.1)]
+        state = f.step(f.start(prior, rng=np.random.default_rng(0)), 1.0, [None, None])
+        (past,) = state.lagged_states
+        pasts.append(wrap(f.summarize(past).mean[:, 0] - centre))
+    # m_past⁺ = m_past + G Δm with G = P / (P + Q) = 1/2 and Δm = ± 0.1
+    error = 1e-12 if family == "gaussian" else 0.02
+    assert np.allclose(pasts[0], [-0.05, 0.05], rtol=0, atol=error)
+    # The same draws, turned: m_past⁺ - θ does not depend on θ.
+    assert np.allclose(pasts[1], pasts[0], rtol=0, atol=1e-9)
+
+
+def test_a_step_of_no_length_separates_no_copies_of_a_model_with_noise() -> None:
+    """Q = dt is zero there, but the next step has noise: the copies remain copies."""
+    walk = Model(1, lambda x, t, dt: x, lambda t, dt: dt * np.eye(1))
+    f = ParticleFilter(walk, [component([0], std=0.5)], members=200, ess_threshold=0.9)
+    rng = np.random.default_rng(0)
+    start = f.start(([0.0], [[1.0]]), rng=rng)
+    weighted = f.step(start, 0.0, [[1.0]])
+    assert weighted.effective_size[0] < 0.9 * 200
+    after = f.step(weighted, 0.0, [None])
+    old, new = (s.particles[0, :, 0] for s in (weighted, after))
+    # Systematic resampling takes a particle ⌊N w⌋ times or once more.
+    assert np.isin(new, old).all()
+    copies = (new[:, None] == old).sum(axis=0)
+    assert (np.abs(copies - 200 * weighted.weights[0]) < 1).all()
+    assert len(np.unique(new)) < 160
+
+
+def test_cross_validation_leaves_out_whole_places() -> None:
+    """∫p̂² - (2/N) Σᵢ p̂₋ᵢ(Xᵢ), where p̂₋ᵢ is the mean over the agents in other places than i."""
+    rng = np.random.default_rng(2)
+    grid = density.Grid((400,))
+    x = np.repeat(0.2 + 0.6 * rng.random((6, 1)), [12, 12, 1, 1, 1, 1], axis=0)
+    n = len(x)
+    silverman = x.std() * (4 / (3 * n)) ** 0.2
+    widths = silverman * np.geomspace(0.15, 1.5, 20)
+    scores = []
+    for h in widths:
+        z = density.kernels(x, grid, bandwidth=h)
+        score = float(grid.integral(z.mean(axis=0) ** 2))
+        for i, cell in enumerate(grid.cell_index(x)):
+            score -= 2 / n * z[x[:, 0] != x[i, 0], cell].mean()
+        scores.append(score)
+    # Means over N - 1 instead would choose a wider kernel.
+    chosen = density.bandwidth(x, grid, rule="least_squares")
+    assert np.isclose(chosen, widths[np.argmin(scores)], rtol=1e-12)
+
+
+def test_the_taper_between_correlated_observations_is_theirs() -> None:
+    """Observations at 3 and 4, components at 0 and 2.5: whitened, each is used in turn by hand."""
+    places, seen_at = np.array([[0.0], [2.5]]), np.array([[3.0], [4.0]])
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((12, 2))
+    h = x @ [[0.5, 1.0], [1.0, -0.5]] + 0.3 * rng.standard_normal((12, 2))
+    y, noise = np.array([1.0, -2.0]), np.array([[0.5, 0.3], [0.3, 0.8]])
+    local = with_localization(
+        partial(etkf, rotation="none"),
+        places=places,
+        observation_places=seen_at,
+        radius=2.0,
+    )
+    rho = gaspari_cohn(np.abs(np.concatenate([places, seen_at]) - seen_at.T) / 2.0)
+    joint = np.concatenate([x, h], axis=1)
+    # W R Wᵀ = I: the observations W y are independent.
+    whitening = np.linalg.inv(np.linalg.cholesky(noise))
+    for w, target in zip(whitening, whitening @ y, strict=True):
+        deviations = joint - joint.mean(axis=0)
+        # c = (ρ ∘ C) w and the mixture's variance s = wᵀ (ρ ∘ C)_hh w, of components (x, h)
+        c = rho * (deviations.T @ deviations[:, 2:] / 11) @ w
+        s = w @ c[2:]
+        z = deviations[:, 2:] @ w
+        z *= np.sqrt(s / z.var(ddof=1))
+        # m⁺ = m + c (y - wᵀ h) / (s + 1), and z⁺ = z / √(s + 1) about it
+        innovation = target - w @ joint[:, 2:].mean(axis=0)
+        moves = innovation / (s + 1) + (1 / np.sqrt(s + 1) - 1) * z / s
+        joint = joint + moves[:, None] * c
+    after = local(x, h, y, noise, rng=rng)
+    assert np.allclose(after, joint[:, :2], rtol=0, atol=1e-10)
+
+
+def test_the_gate_of_a_sum_of_one_component_is_that_of_a_gaussian() -> None:
+    """x² of N(½, 1) has the mean 1.25 and the variance 4 m² P + 2 P² = 3: slope alone, 1."""
+    square = Sensor(1, lambda x: x**2, [[0.1]])
+    options: dict[str, Any] = {
+        "linearization": "unscented",
+        "kappa": 2.0,
+        "gate_probability": 0.99,
+    }
+    one = GaussianSumFilter(STILL, [square], **options)
+    plain = GaussianFilter(STILL, [square], **options)
+    # The chi-squared quantile 6.635 bounds r² / (3 + 0.1): |r| < 4.535, and 2.70 by slope alone.
+    for r, rejected in ((4.5, 0), (4.57, 1), (3.0, 0)):
+        seen = [[1.25 + r]]
+        mixture = one.step(
+            one.start(GaussianMixture.gaussian([0.5], [[1.0]])), 0.0, seen
+        )
+        gaussian = plain.step(plain.start(([0.5], [[1.0]])), 0.0, seen)
+        assert mixture.rejected[0] == gaussian.rejected[0] == rejected
+        assert np.allclose(mixture.means, gaussian.means, rtol=1e-12)
+
+
+@pytest.mark.parametrize("average", ["weighted", "hybrid", "measurements"])
+def test_the_consensus_on_headings_is_the_central_filter(average: Any) -> None:
+    """Agents at 3.1 and -3.1 with exact averages: the information of both, about π."""
+    still = Model(
+        1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)), periods=(TURN,)
+    )
+    compass = Sensor(1, lambda x: x, [[0.25]], periods=(TURN,))
+    f = InformationConsensusFilter(
+        still,
+        [compass, compass],
+        graphs.path(2),
+        fusion=network.finite_time_consensus,
+        average=average,
+    )
+    p, r, y = 0.5, 0.25, np.array([3.0, 0.2 - np.pi])
+    state = f.step(f.start([([m], [[p]]) for m in (3.1, -3.1)]), 0.0, y[:, None])
+    # From π, the first prior is at -0.0416 and the second at 0.0416; the averages have 0.
+    priors = np.array([3.1 - np.pi, np.pi - 3.1])
+    priors = priors if average == "measurements" else np.zeros(2)
+    # m⁺ = (m / P + Σ y / R) / (1 / P + 2 / R)
+    expected = (priors / p + wrap(y - np.pi).sum() / r) / (1 / p + 2 / r)
+    assert np.allclose(wrap(state.means[:, 0] - np.pi), expected, rtol=0, atol=1e-9)
+    assert np.allclose(state.covariances, 1 / (1 / p + 2 / r), rtol=1e-9)
