@@ -32,7 +32,7 @@ def delayed_observation() -> Comparison:
 
 
 def first_sight() -> Comparison:
-    """A landmark is first seen, 5 ahead of a robot; then the robot's place is measured."""
+    """A landmark is first seen, 5 ahead of a robot; then the robot is located."""
     f = GaussianFilter(STILL, [UNIT])
     # The landmark has no belief before; any number will do.
     state = f.start(([3.0, 0.0], np.diag([4.0, 1.0])))
@@ -45,7 +45,7 @@ def first_sight() -> Comparison:
 
 
 def restart() -> Comparison:
-    """After a restart a sensor's bias is a new one: N(0, 0.5²), whatever it was before."""
+    """After a restart a sensor's bias is a new one, N(0, 0.5²)."""
     total = Sensor(1, lambda x: x.sum(axis=-1, keepdims=True), [[1.0]])
     f = GaussianFilter(STILL, [total])
     state = f.step(f.start(([0.0, 0.0], np.eye(2))), 1.0, [[1.0]])
@@ -83,9 +83,11 @@ def matrix_of_time() -> Comparison:
 
 
 def known_constant() -> Comparison:
-    """A belt moves at exactly 2 m/s: a component of variance zero, which stays at zero."""
+    """A belt moves at exactly 2 m/s: a component of variance zero."""
     belt = LinearModel.from_transition(
-        2, lambda dt: np.array([[1.0, dt], [0.0, 1.0]]), lambda t, dt: np.zeros((2, 2))
+        2,
+        lambda dt: np.array([[1.0, dt], [0.0, 1.0]]),
+        lambda t, dt: np.zeros((2, 2)),
     )
     f = GaussianFilter(belt, [UNIT], linearization="unscented")
     state = f.start(([0.0, 2.0], np.diag([1.0, 0.0])))
@@ -117,7 +119,7 @@ def odometry() -> Comparison:
 
 
 def likelihoods() -> Comparison:
-    """Counts, an outlier in Student's t noise, a radar whose noise grows with distance."""
+    """Counts, an outlier in Student's t noise, noise that grows with distance."""
     models: list[Callable[[np.ndarray, np.ndarray], np.ndarray]] = [
         lambda x, y: stats.poisson.logpmf(y, x)[..., 0],
         lambda x, y: stats.t.logpdf(y, 3, loc=x, scale=0.5)[..., 0],
@@ -128,17 +130,19 @@ def likelihoods() -> Comparison:
     means = []
     by_hand = []
     for log_likelihood, y in zip(models, ([9.0], [12.0], [6.0]), strict=True):
-        f = ParticleFilter(WALK, [LikelihoodSensor(1, log_likelihood)], members=50_000)
+        sensor = LikelihoodSensor(1, log_likelihood)
+        f = ParticleFilter(WALK, [sensor], members=50_000)
         state = f.start(prior, rng=np.random.default_rng(0))
         means.append(f.summarize(f.step(state, 0.0, [y])).mean[0, 0])
         # ∫ x p(x) p(y | x) dx / ∫ p(x) p(y | x) dx
-        density = prior.pdf(cells[:, 0]) * np.exp(log_likelihood(cells, np.array(y)))
+        likelihood = np.exp(log_likelihood(cells, np.array(y)))
+        density = prior.pdf(cells[:, 0]) * likelihood
         by_hand.append(density @ cells[:, 0] / density.sum())
     return np.array(means), np.array(by_hand)
 
 
 def evidence() -> Comparison:
-    """The log-evidence of a model and the NIS of its observations, from the record."""
+    """The log-evidence of a model and the NIS of its observations."""
     f = GaussianFilter(WALK, [UNIT], record_evidence=True)
     t = np.array([1.0, 2.0, 4.0])
     y = np.array([0.2, 1.1, -0.9])

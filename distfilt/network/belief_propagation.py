@@ -31,10 +31,11 @@ def gaussian_belief_propagation(
     :math:`\exp(-\tfrac12\mathbf x^\top\mathbf J\mathbf x+\mathbf h^\top\mathbf x)`, and agents i
     and j are coupled by :math:`\mathbf J_{ij}` only if they are neighbours. Agent j sends to i
 
-    .. math:: \boldsymbol\Lambda_{j\to i}=-\mathbf J_{ij}\mathbf M^{-1}\mathbf J_{ji},\qquad
-        \boldsymbol\eta_{j\to i}=-\mathbf J_{ij}\mathbf M^{-1}
-        \Bigl(\mathbf h_j+\sum_{k\ne i}\boldsymbol\eta_{k\to j}\Bigr),\qquad
-        \mathbf M=\mathbf J_{jj}+\sum_{k\ne i}\boldsymbol\Lambda_{k\to j}
+    .. math::
+        \boldsymbol\Lambda_{j\to i} &= -\mathbf J_{ij}\mathbf M^{-1}\mathbf J_{ji}
+        \\ \boldsymbol\eta_{j\to i} &= -\mathbf J_{ij}\mathbf M^{-1}
+        \Bigl(\mathbf h_j+\sum_{k\ne i}\boldsymbol\eta_{k\to j}\Bigr)
+        \\ \mathbf M &= \mathbf J_{jj}+\sum_{k\ne i}\boldsymbol\Lambda_{k\to j}
 
     On a tree means and covariances are exact after as many rounds as the diameter. On a graph with
     circles the means are exact if the rounds converge, as they do where every row of J is

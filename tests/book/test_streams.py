@@ -96,7 +96,7 @@ def run_with_constant(name: str) -> None:
 
 
 CALLS = {
-    "delayed": partial(run_filter, delayed=(Observation(1.4, 0, [0.5]),), lag=3),
+    "delay": partial(run_filter, delayed=(Observation(1.4, 0, [0.5]),), lag=3),
     "reset": reset_state,
     "priors": partial(run_filter, prior=[PRIOR, ([1.0], [[2.0]])]),
     "matrix": partial(run_filter, model=DECAY),
