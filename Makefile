@@ -37,12 +37,13 @@ ifndef CHECKING
 endif
 .PHONY: help environment remake book test unit types style check-notebooks regress slow outputs \
 	check-determinism update-scenarios studies check-studies bench mutants check-portability \
-	test-versions lab lock pdf epub clean $(PAGES)
+	test-versions lab lock dist pdf epub slides clean $(PAGES)
 
 help:
 	@echo "make environment        the packages and the library, in .venv"
 	@echo "make book               environment and HTML (warnings are errors); prints the page's path"
 	@echo "make pdf, make epub     the whole book in one file (needs Chromium and its driver)"
+	@echo "make slides             the pictures for a lecture, in _build/slides"
 	@echo "make test               the book, then every check: the next five, and the browser"
 	@echo "  make unit             unit, property and doc tests"
 	@echo "  make types            mypy in strict mode"
@@ -61,6 +62,7 @@ help:
 	@echo "make mutants            how many of SAMPLE=300 random mutations the tests detect, written to data/bench"
 	@echo "make lab                JupyterLab on a working copy of the chapters (LAB=folder for another one)"
 	@echo "make lock               resolve requirements.txt again"
+	@echo "make dist               wheel and source archive in dist; README's code runs with each, alone"
 	@echo "make clean              remove what was built (the environment and the working copy stay)"
 
 environment: $(STAMP)
@@ -80,11 +82,14 @@ remake:
 $(BUILT): $(STAMP) _toc.yml CITATION.cff \
 		$(shell find book distfilt data -type f ! -path "*/__pycache__/*" ! -path "*/_generated/*" ! -path "*/.*")
 	rm -rf $(HTML) $@
-	$(PY) -m sphinx -b html -W --keep-going -q -E -d _build/doctrees -c book . $(HTML)
+	$(PY) -m sphinx -b html -j auto -W --keep-going -q -E -d _build/doctrees -c book . $(HTML)
 	@touch $@
 
 book: $(BUILT)
 	@echo "The book: $(CURDIR)/$(HTML)/book/index.html"
+
+slides: $(STAMP)
+	$(PY) book/tools/slides.py
 
 pdf epub: book
 	$(PY) book/tools/volume.py $@
@@ -161,10 +166,19 @@ lab: $(STAMP)
 	$(PY) book/tools/lab.py "$(LAB)"
 
 lock: $(STAMP)
-	$(PY) -m uv pip compile --quiet --universal --fork-strategy fewest --python-version 3.11 --no-emit-index-url \
+	$(PY) -m uv pip compile --quiet --system-certs --universal --fork-strategy fewest --python-version 3.11 --no-emit-index-url \
 		--no-emit-find-links --no-header --no-annotate --generate-hashes \
-		--extra book --extra test --extra mutants --extra dask --extra mpi \
+		--extra book --extra test --extra logs --extra mutants --extra dask --extra mpi \
 		pyproject.toml requirements.in --output-file requirements.txt
+
+# An empty environment for each of the two files; its packages come from the network.
+dist: $(STAMP)
+	rm -rf dist
+	$(PY) -m uv build --quiet --no-build-isolation --python $(PY) --out-dir dist .
+	@for file in dist/*.whl dist/*.tar.gz; do \
+		$(PY) -m uv run --quiet --system-certs --isolated --no-project --python "$(PYTHON)" \
+			--with "./$$file" python tests/tools/readme.py || exit 1; \
+	done
 
 clean:
 	find _build -mindepth 1 -maxdepth 1 -not -name lab -exec rm -rf {} + 2>/dev/null || true

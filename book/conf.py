@@ -27,12 +27,14 @@ from sphinx.application import Sphinx
 from sphinx.environment.collectors.toctree import TocTreeCollector
 from sphinx.errors import ExtensionError
 from sphinx.util.nodes import make_refnode
+from sphinx_proof.domain import ProofDomain
 
 sys.path.insert(0, str(Path(__file__).parent / "tools"))
 
 import distfilt
 from access import mend
 from common import BOOK, ROOT, chapters, missing_pages
+from lab import downloadable, write_downloads
 from light import lighten
 from pages import (
     chapter_label,
@@ -77,6 +79,7 @@ external_toc_exclude_missing = False
 include_patterns = ["book/**"]
 exclude_patterns = [
     "book/_generated/**",
+    "book/course/**",
     "book/examples/**",
     "book/tools/**",
     "**/.ipynb_checkpoints",
@@ -151,6 +154,7 @@ html_theme = "sphinx_book_theme"
 html_title = project
 html_static_path = ["_static"]
 html_css_files = ["book.css"]
+html_js_files = ["scroll.js"]
 html_favicon = "_static/mark.svg"
 html_logo = "_static/mark.svg"
 html_search_scorer = str(Path(__file__).parent / "_static" / "search.js")
@@ -279,20 +283,16 @@ def link_names(
         f'<p class="notebook"><a href="_notebooks/{source.stem}.ipynb" download>'
         "Download this page as a notebook</a></p>"
     )
-    # Only numbered chapters are offered for download, below their titles.
-    if chapter_number(page):
+    if source in downloadable():
         context["body"] = context["body"].replace("</h1>", f"</h1>\n{offer}", 1)
     names = imports_of(code_of(source), app.env.distfilt_homes)
     context["body"] = link_code(context["body"], names, url)
 
 
-def copy_notebooks(app: Sphinx, error: Exception | None) -> None:
-    """Copy the notebooks beside their pages, for download."""
-    target = Path(app.outdir) / "book" / "_notebooks"
+def write_notebooks(app: Sphinx, error: Exception | None) -> None:
+    """Write the notebooks beside their pages, for download."""
     if error is None and app.builder.name == "html":
-        target.mkdir(parents=True, exist_ok=True)
-        for source in chapters():
-            shutil.copy(source.with_suffix(".ipynb"), target)
+        write_downloads(Path(app.outdir) / "book" / "_notebooks")
 
 
 def finish(app: Sphinx, error: Exception | None) -> None:
@@ -315,6 +315,11 @@ def setup(app: Sphinx) -> None:
         return renumbered
 
     TocTreeCollector.assign_figure_numbers = with_chapter_numbers  # type: ignore[method-assign]
+    # It counts sections when all pages are read, so pages may be read in parallel; it does not say
+    # so itself.
+    app.extensions["sphinx_multitoc_numbering"].parallel_read_safe = True
+    # Proofs of pages that were read in parallel are merged by an event; the domain has no data.
+    ProofDomain.merge_domaindata = lambda self, pages, other: None
     app.connect("builder-inited", check_toc)
     app.connect("builder-inited", lambda app: write_generated(BOOK / "_generated"))
     app.connect(
@@ -329,5 +334,5 @@ def setup(app: Sphinx) -> None:
         "autodoc-process-signature", lambda *event: signature(event[1], event[3])
     )
     app.connect("build-finished", copy_mathjax)
-    app.connect("build-finished", copy_notebooks)
+    app.connect("build-finished", write_notebooks)
     app.connect("build-finished", finish)

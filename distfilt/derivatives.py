@@ -405,17 +405,34 @@ def evaluate_derivative(
                     4,
                 )
         return slope
-    copies = [x.copy() if isinstance(x, np.ndarray) else x for x in args]
-    slope = np.asarray(call_user(owner.derivative, *copies))
-    if slope.shape not in (shape, shape[-2:]):
-        raise ValueError(f"derivative must return shape {shape}, got {slope.shape}")
+    slope = call_derivative(owner.derivative, args, shape)
     if is_first_use(owner, "derivative") and _contradicts(slope, differences, static):
         warnings.warn(
             "derivative does not match finite differences of its function",
             RuntimeWarning,
             4,
         )
-    return slope if slope.shape == shape else np.broadcast_to(slope, shape)
+    return slope
+
+
+def call_derivative(
+    derivative: Callable[..., Array],
+    args: tuple[Array | float, ...],
+    shape: tuple[int, ...],
+) -> Array:
+    """Call a given derivative with copies of its arrays, and check its shape.
+
+    >>> call_derivative(lambda x: np.eye(2), (np.zeros((3, 2)),), (3, 2, 2)).shape
+    (3, 2, 2)
+    """
+    copies = [x.copy() if isinstance(x, np.ndarray) else x for x in args]
+    slope = np.asarray(call_user(derivative, *copies))
+    if slope.shape == shape:
+        return slope
+    # One matrix for all states.
+    if slope.shape != shape[-2:]:
+        raise ValueError(f"derivative must return shape {shape}, got {slope.shape}")
+    return np.broadcast_to(slope, shape)
 
 
 def needs_differences(owner: HasDerivative) -> bool:

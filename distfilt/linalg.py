@@ -11,6 +11,7 @@ from contextlib import suppress
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv, dpotrf, dtrtrs
 
 from .validation import Array, PositiveSemidefinite, validated
@@ -52,6 +53,15 @@ def identity(dim: int) -> Array:
     matrix = np.eye(dim)
     matrix.setflags(write=False)
     return matrix
+
+
+@lru_cache(maxsize=16)
+def upper_triangle(dim: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the rows and columns of a matrix's upper triangle, made once and read-only."""
+    rows, columns = np.triu_indices(dim)
+    rows.setflags(write=False)
+    columns.setflags(write=False)
+    return rows, columns
 
 
 def symmetrise(m: Array) -> Array:

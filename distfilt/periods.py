@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .validation import Array, InvalidArgumentError
 from .validation.first_use import mark_checked, needs_check
@@ -115,10 +117,15 @@ def _read_period(period: object) -> float | None:
     return float(period)
 
 
-def _circular(periods: Periods) -> tuple[list[int], Array]:
-    """Return the indices of the circular components, and their periods."""
-    places = [k for k, period in enumerate(periods) if period is not None]
-    return places, np.array([periods[k] for k in places], dtype=np.float64)
+@lru_cache(maxsize=64)
+def _circular(periods: Periods) -> tuple[NDArray[np.intp], Array]:
+    """Return the indices of the circular components, and their periods; both read-only."""
+    circular = [k for k, period in enumerate(periods) if period is not None]
+    places = np.array(circular, dtype=np.intp)
+    p = np.array([periods[k] for k in circular], dtype=np.float64)
+    places.setflags(write=False)
+    p.setflags(write=False)
+    return places, p
 
 
 def align(values: Array, reference: Array, periods: Periods) -> Array:
@@ -132,7 +139,11 @@ def align(values: Array, reference: Array, periods: Periods) -> Array:
     if not periods:
         return values
     places, p = _circular(periods)
-    turns = _count_turns(values[..., places] - reference[..., places], p)
+    difference = values.take(places, axis=-1) - reference.take(places, axis=-1)
+    # The usual case: all lie within half a period. NaN, a missing number, does not.
+    if np.count_nonzero(np.abs(difference) < 0.5 * p) == difference.size:
+        return values
+    turns = _count_turns(difference, p)
     if not turns.any():
         return values
     result = np.array(np.broadcast_to(values, (*turns.shape[:-1], len(periods))))
@@ -215,15 +226,12 @@ def gather(
     bring_near: Callable[[Array, Array], Array],
     tangent: Callable[[], Array | None],
     fallback: Callable[[], Array],
-    half_periods: Array | None = None,
 ) -> Array:
     """Bring a function's values at N points (..., N, m) onto one branch.
 
     Where the values lie within half a period, there is only one. Otherwise the branch continues
     the tangent at the points' mean, if the function is linear up to wraps, as that of a compass
-    is, or if the tangent's values have a standard deviation of at most half a period, so that it
-    says on which side of the mean a point lies. If not, each value is brought near that of
-    `fallback`.
+    is. If not, each value is brought near that of `fallback`.
 
     Parameters
     ----------
@@ -232,8 +240,6 @@ def gather(
         ``bring_near(values, reference)``, on the branch of the reference.
     tangent, fallback : callable
         References (..., N, m) or (..., 1, m); a tangent may be None if there is none.
-    half_periods : ndarray, (m,), optional
-        Without them only linear functions continue their tangent.
     """
     by_first = bring_near(values, values[..., :1, :])
     high = np.fmax.reduce(by_first, axis=-2, keepdims=True)
@@ -248,10 +254,8 @@ def gather(
     if line is not None:
         by_line = bring_near(values, line)
         error = np.abs(by_line - line).max(axis=-2, keepdims=True)
-        follows = error <= _LINEAR * np.ptp(line, axis=-2, keepdims=True)
-        if half_periods is not None:
-            follows |= line.std(axis=-2, keepdims=True) <= half_periods
-        wide = np.where(follows, by_line, wide)
+        is_linear = error <= _LINEAR * np.ptp(line, axis=-2, keepdims=True)
+        wide = np.where(is_linear, by_line, wide)
     return np.where(is_wide, wide, by_first)
 
 
@@ -273,6 +277,10 @@ def step_members(model: _Model, x: Array, t: float, dt: float) -> Array:
     values = model.step(x, t, dt)
     periods = cast(Periods, model.periods)
     if not periods:
+        return values
+    if x.shape[-2] == 1:
+        # A single member is on one branch by itself.
+        check_transition(model, x[..., 0, :], t, dt)
         return values
     centre = x.mean(axis=-2)
     check_transition(model, centre, t, dt)
@@ -377,11 +385,10 @@ def warn_of_wrapping(
         return
     *row, place = suspects[0].tolist()
     # The proof: the function itself does not tell x from x + 2π.
-    state = x[tuple(row)][:1]
-    turned = state.copy()
-    turned[:, place] += 2 * np.pi
-    change = np.abs(model.step(turned, t, dt) - model.step(state, t, dt))
-    if (change > 1e-6).any():
+    turned = x.copy()
+    turned[..., place] += 2 * np.pi
+    change = np.abs(model.step(turned, t, dt) - model.step(x, t, dt))
+    if (change[tuple(row)][0] > 1e-6).any():
         return
     mark_checked(model, "wrapping")
     period = "2π"

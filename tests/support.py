@@ -29,7 +29,8 @@ def spd(
     """Random full covariances with eigenvalues above `least`."""
     a = rng.standard_normal((*leading, d, d))
     # A Aᵀ + λ I has no eigenvalue below λ.
-    return a @ np.swapaxes(a, -1, -2) + least * np.eye(d)
+    square = a @ np.swapaxes(a, -1, -2)
+    return square + least * np.eye(d)
 
 
 def singular(

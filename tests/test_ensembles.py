@@ -101,9 +101,9 @@ def test_exact_noise_is_exact_down_to_the_last_member(
     rank = data.draw(st.integers(0, k))
     cov = spd(rng, k, (2,)) if rank == k else singular(rng, k, rank, (2,))
     n = max(2, p + rank + more)
-    avoid = (
-        rng.standard_normal((2, n, p)) @ np.diag(10.0 ** rng.uniform(-6, 6, p)) + 1.0
-    )
+    standard = rng.standard_normal((2, n, p))
+    scales = 10.0 ** rng.uniform(-6, 6, p)
+    avoid = standard * scales + 1.0
     noise = exact_noise(avoid, factor(cov), rng)
     assert noise.shape == (2, n, k)
     _exact(avoid, cov, noise)
@@ -127,7 +127,9 @@ def test_exact_noise_beside_anomalies_that_depend_on_each_other(n: int) -> None:
             noise = exact_noise(joint, factor(FULL), rng)
             _exact(joint, FULL, noise)
     # Constant components and a copy at 1e6 add no anomaly.
-    flat = np.concatenate([x, np.zeros((3, n, 2)), 1e6 + x[..., :1]], axis=-1)
+    constant = np.zeros((3, n, 2))
+    copy = 1e6 + x[..., :1]
+    flat = np.concatenate([x, constant, copy], axis=-1)
     noise = exact_noise(flat, factor(FULL), rng)
     _exact(flat[..., :6], FULL, noise)
 
@@ -189,5 +191,7 @@ def test_exact_noise_is_uniform_over_the_free_directions() -> None:
     variance = 4.0 * 7 / 5
     expected = variance * projection
     # Six standard errors
-    assert np.abs(covariance - expected).max() < 6 * variance / np.sqrt(20_000)
-    assert np.abs(noise.mean(axis=0)).max() < 6 * np.sqrt(variance / 20_000)
+    cov_error = variance / np.sqrt(20_000)
+    mean_error = np.sqrt(variance / 20_000)
+    assert np.abs(covariance - expected).max() < 6 * cov_error
+    assert np.abs(noise.mean(axis=0)).max() < 6 * mean_error

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scoringrules
 from scipy import stats
-from scipy.integrate import quad
 
 from distfilt.metrics import (
     crps,
@@ -63,7 +63,9 @@ def test_nees_band_has_its_probability(dim, runs, level):
     band = nees_band(dim, runs, level=level)
     # The sum of n NEES values is chi-square with n d degrees of freedom.
     law = stats.chi2(dim * runs)
-    probability = law.cdf(band.high * runs) - law.cdf(band.low * runs)
+    below_high = law.cdf(band.high * runs)
+    below_low = law.cdf(band.low * runs)
+    probability = below_high - below_low
     assert probability == pytest.approx(level, abs=1e-10)
     # Divided by d, with the expected value 1
     unit = nees_band(dim, runs, level=level, normalised=True)
@@ -82,32 +84,24 @@ def test_nees_band_has_its_probability(dim, runs, level):
 @pytest.mark.parametrize(
     "mean, std, truth", [(0.0, 1.0, 0.0), (2.0, 0.3, 1.1), (-1.0, 5.0, 9.0)]
 )
-def test_gaussian_crps_equals_its_integral(mean, std, truth):
-    cdf = stats.norm(mean, std).cdf
-    # ∫ (F(u) - 1{u ≥ y})² du, below and above the truth y.
-    below, _ = quad(lambda u: cdf(u) ** 2, mean - 12 * std, truth, epsabs=1e-12)
-    above, _ = quad(lambda u: (1 - cdf(u)) ** 2, truth, mean + 12 * std, epsabs=1e-12)
-    score = gaussian_crps(mean, std, truth)
-    assert score == pytest.approx(below + above, abs=1e-9)
+def test_gaussian_crps_is_that_of_scoringrules(mean, std, truth):
+    exact = scoringrules.crps_normal(truth, mean, std)
+    assert gaussian_crps(mean, std, truth) == pytest.approx(exact, rel=1e-12)
 
 
 @pytest.mark.parametrize("n", [1, 2, 50])
-def test_crps_is_its_definition(n):
+def test_crps_is_that_of_scoringrules(n):
     rng = generator(n)
     x = rng.standard_normal((3, n, 2))
     y = rng.standard_normal((3, 2))
-    w = rng.dirichlet([1] * n, 3)
-    scores = crps(x, y, weights=w)
-    for r in range(3):
-        for k in range(2):
-            a = x[r, :, k]
-            # E|X - y| - ½ E|X - X'|
-            distances = np.abs(a[:, None] - a)
-            pairs = w[r] @ distances @ w[r]
-            exact = w[r] @ np.abs(a - y[r, k]) - pairs / 2
-            assert scores[r, k] == pytest.approx(exact, abs=1e-13)
-    equal = [np.full(n, 1 / n)] * 3
-    assert np.allclose(crps(x, y, weights=equal), crps(x, y), atol=1e-13)
+    weights = rng.dirichlet([1] * n, 3)
+    # E|X - y| - ½ E|X - X'| by its double sum
+    options = {"m_axis": 1, "estimator": "nrg"}
+    exact = scoringrules.crps_ensemble(y, x, **options)
+    assert np.allclose(crps(x, y), exact, rtol=0, atol=1e-13)
+    both = np.broadcast_to(weights[..., None], x.shape)
+    exact = scoringrules.crps_ensemble(y, x, ens_w=both, **options)
+    assert np.allclose(crps(x, y, weights=weights), exact, rtol=0, atol=1e-13)
 
 
 # --- intervals --------------------------------------------------------------------------------
@@ -115,19 +109,21 @@ def test_crps_is_its_definition(n):
 
 @pytest.mark.parametrize("level", [0.5, 0.9, 0.95, 0.99])
 @pytest.mark.parametrize("n", [2, 3, 8, 50, 301])
-def test_intervals_are_those_of_scipy(n, level):
+def test_intervals_have_their_level(n, level):
     values = np.random.default_rng(n).standard_normal(n) ** 3
     interval = mean_interval(values, level=level)
-    standard_error = stats.sem(values)
-    exact = stats.t.interval(level, n - 1, values.mean(), standard_error)
-    assert (interval.low, interval.high) == pytest.approx(exact, rel=1e-12)
-    assert interval.error == pytest.approx(standard_error, rel=1e-12)
+    exact = stats.ttest_1samp(values, 0).confidence_interval(level)
+    assert (interval.low, interval.high) == pytest.approx(tuple(exact), rel=1e-12)
+    assert interval.error == pytest.approx(stats.sem(values), rel=1e-12)
+    tail = (1 - level) / 2
     for k in sorted({0, 1, n // 3, n - 1, n}):
         ours = proportion_interval(k, n, level=level)
-        theirs = stats.binomtest(k, n).proportion_ci(level, method="exact")
-        # scipy searches these roots; the quantiles of the beta distribution are the
-        # roots.
-        assert (ours.low, ours.high) == pytest.approx(tuple(theirs), abs=1e-11)
+        # One tail beyond each end, but for the ends 0 and 1
+        above = stats.binom.sf(k - 1, n, ours.low)
+        below = stats.binom.cdf(k, n, ours.high)
+        assert (above, below) == pytest.approx((tail if k else 1, tail if k < n else 1))
+        assert (ours.low == 0) == (k == 0)
+        assert (ours.high == 1) == (k == n)
         # √(p (1 - p) / n)
         p = k / n
         standard_error = np.sqrt(p * (1 - p) / n)
@@ -138,6 +134,12 @@ def test_intervals_are_those_of_scipy(n, level):
         theirs = stats.quantile_test(values).confidence_interval(level)
         assert (ours.low, ours.high) == tuple(theirs)
         assert ours.estimate == np.median(values)
+
+
+def test_a_level_that_is_met_exactly_needs_no_wider_interval():
+    # The range of three values misses the median with probability 2 / 2^3.
+    interval = median_interval([1.0, 2.0, 4.0], level=0.75)
+    assert (interval.low, interval.high) == (1, 4)
 
 
 def test_values_that_are_all_alike():

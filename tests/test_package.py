@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import os
+import runpy
 import subprocess
 import sys
 import tomllib
@@ -200,9 +201,11 @@ def test_import_loads_no_heavy_package() -> None:
 
 def test_lock_names_no_registry_and_has_a_hash_for_every_file() -> None:
     text = (ROOT / "requirements.txt").read_text(encoding="utf-8").replace("\\\n", "")
-    assert "//" not in text and "--index" not in text
+    assert "//" not in text
+    assert "--index" not in text
     pins = [line for line in text.splitlines() if line and not line.startswith("#")]
-    assert pins and all("==" in pin and "--hash=sha256:" in pin for pin in pins)
+    assert pins
+    assert all("==" in pin and "--hash=sha256:" in pin for pin in pins)
 
 
 def test_version_stands_in_one_place_and_is_the_one_to_cite() -> None:
@@ -246,3 +249,12 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
 def test_installed_library_runs_alone(wheel: Path) -> None:
     code = "import distfilt; from distfilt import filters; print(distfilt.__file__)"
     assert Path(run(code, wheel).strip()).is_relative_to(wheel)
+
+
+def test_readme_runs_with_the_installed_library(wheel: Path) -> None:
+    script = str(ROOT / "tests" / "tools" / "readme.py")
+    code = f"import runpy; runpy.run_path({script!r}, run_name='__main__')"
+    # `make dist` must not try the repository's library by mistake.
+    with pytest.raises(SystemExit, match="the installed library is needed"):
+        runpy.run_path(script, run_name="__main__")
+    assert f"README.md runs: distfilt {distfilt.__version__}" in run(code, wheel)

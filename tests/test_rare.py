@@ -17,15 +17,11 @@ from distfilt.network import Channel, Faults, Graph, graphs
 from distfilt.sensors import Sensor, component, distance, stack
 from distfilt.triangular import affine, compose
 from distfilt.updates.particles import distinct_fraction
+from tests.filters.families import still_model
 
 # Orthogonal directions: SHARP has the standard deviations 100 and 1e-4 along them.
 U, V = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2)
 SHARP = 1e4 * np.outer(U, U) + 1e-8 * np.outer(V, V)
-
-
-def constant_state(dim: int) -> models.Model:
-    """Return a model whose state stays, without noise."""
-    return models.Model(dim, lambda x, t, dt: x, lambda t, dt: np.zeros((dim, dim)))
 
 
 def test_a_received_belief_may_be_a_million_times_sharper() -> None:
@@ -82,7 +78,7 @@ def test_increments_wait_while_an_agent_is_silent_or_they_are_tiny() -> None:
     silence = Faults(silent=[0], during=[(0.5, 1.5)])
     make = partial(
         InformationIncrementFilter,
-        constant_state(1),
+        still_model(1),
         graph=graphs.path(2),
         target_dim=1,
     )
@@ -187,7 +183,7 @@ def test_serial_observations_meet_new_predictions_within_a_wrapper() -> None:
     serial = updates.serially(partial(updates.etkf, rotation="none"))
     origins = ([0.0, 0.0], [3.0, 0.0], [0.0, 3.0])
     sensors = [distance([0, 1], std=0.1, origin=origin) for origin in origins]
-    model = constant_state(2)
+    model = still_model(2)
     # An inflation by 1 and a partial without options change nothing.
     inflated = updates.with_inflation(serial, factor=1.0)
     results = []

@@ -31,7 +31,7 @@ PUBLIC = {
 }
 NOT_VALIDATED = {
     r"linalg\..*": "for loops, whose arguments were checked before",
-    r".*(Error|Collapse|Gain|Disconnected)": "an error or a warning, which a user catches",
+    r".*(Error|Collapse|Gain|Disconnected|BiasedAverage)": "an error or a warning, which a user catches",
     r"filters\.(\w*State|Summary|Filter)|network\.\w*(State|Result)|metrics\.Interval|coupling\.TransportPlan": "made by the library, or a base class",
     r"ensembles\.Members|models\.Swarm": "a type",
     r"density\.(Centralised|Neighbours|ConsensusProtocol)": "a protocol, and two that have no arguments",

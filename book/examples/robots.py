@@ -1,7 +1,6 @@
-"""Five robots with odometry track a sixth: sightings at any time, contact every ten seconds."""
+"""Five robots estimate their poses and track a sixth, with contact every ten seconds."""
 
 import tempfile
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,15 +9,17 @@ import numpy as np
 
 from distfilt import filters
 from distfilt.mixtures import target_fusion
-from distfilt.models import constant_velocity
+from distfilt.models import Inputs, Model, constant_velocity
 from distfilt.network import graphs
-from distfilt.sensors import Sensor, range_bearing
+from distfilt.sensors import range_bearing
 
 STD = (0.3, 0.04)  # of range, in m, and bearing, in rad
+ODOMETRY_STD = (0.05, 0.01)  # of speed, in m/s, and turn rate, in rad/s, for a second
+START_STD = (0.1, 0.1, 0.02)  # of the first poses
 RATE = 0.4  # sightings of a robot a second
-END = 120.0
+END = 60.0
 ROBOTS = 5
-Pose = tuple[float, float, float]
+TARGET = constant_velocity(sigma=0.03)
 
 
 def target(t: Any) -> np.ndarray:
@@ -30,77 +31,109 @@ def target(t: Any) -> np.ndarray:
     return arc * [20, 20, 0.5, 0.5]
 
 
-def first_pose(robot: int) -> Pose:
-    """Where a robot starts: x, y and heading."""
-    return 8.0 * robot - 16, -5.0, 0.3 * robot
+def first_poses() -> np.ndarray:
+    """Where the robots start: x, y and heading, (5, 3)."""
+    robot = np.arange(ROBOTS)
+    return np.stack([8.0 * robot - 16, np.full(ROBOTS, -5.0), 0.3 * robot], axis=-1)
 
 
-def drive(pose: Pose, speed: float, turn: float, dt: float) -> Pose:
-    """The pose after a straight drive, then a turn."""
-    x, y, heading = pose
-    x = x + dt * speed * np.cos(heading)
-    y = y + dt * speed * np.sin(heading)
-    return x, y, heading + dt * turn
+def drive(poses: np.ndarray, inputs: np.ndarray, dt: float) -> np.ndarray:
+    """Move poses (..., 5, 3) by speeds and turn rates (5, 2)."""
+    speed, turn = inputs.T
+    heading = poses[..., 2] + dt * turn / 2
+    shift = [
+        speed * np.cos(heading),
+        speed * np.sin(heading),
+        np.broadcast_to(turn, heading.shape),
+    ]
+    return np.asarray(poses + dt * np.stack(shift, axis=-1))
 
 
-def sensor_at(pose: Pose) -> Sensor:
-    """The range-bearing sensor of a robot at a pose."""
-    x, y, heading = pose
-    return range_bearing((0, 1), std=STD, origin=(x, y), heading=heading)
+def simulate(folder: Path, rng: np.random.Generator) -> np.ndarray:
+    """Write odometry and sightings, of which one in twenty is an outlier; return the poses.
+
+    The poses, (61, 5, 3), are for scores.
+    """
+    sensors = [sensor_of(robot) for robot in range(ROBOTS)]
+    poses = [first_poses() + START_STD * rng.standard_normal((ROBOTS, 3))]
+    odometry = []
+    sightings = []
+    for t in np.arange(END):
+        turn = 0.05 * np.sin(t / 10 + np.arange(ROBOTS))
+        inputs = np.stack([np.full(ROBOTS, 0.4), turn], axis=-1)
+        errors = ODOMETRY_STD * rng.standard_normal((ROBOTS, 2))
+        odometry.append([t, *(inputs + errors).ravel()])
+        for robot in range(ROBOTS):
+            for after in rng.random(rng.poisson(RATE)):
+                now = drive(poses[-1], inputs, after)
+                state = np.append(target(t + after), now)
+                seen = sensors[robot].observe(state, rng=rng)
+                outlier = 8.0 * (rng.random() < 0.05)
+                sightings.append([t + after, robot, *(seen + outlier)])
+        poses.append(drive(poses[-1], inputs, 1.0))
+    np.savetxt(folder / "odometry.csv", odometry, delimiter=",")
+    np.savetxt(folder / "sightings.csv", sorted(sightings), delimiter=",")
+    return np.array(poses)
 
 
-def simulate(path: Path, rng: np.random.Generator) -> None:
-    """Write each robot's log: odometry and sightings, of which one in twenty is an outlier."""
-    rows = []
-    for robot in range(ROBOTS):
-        pose = first_pose(robot)
-        t = 0.0
-        while True:
-            dt = rng.exponential(1 / RATE)
-            if t + dt >= END:
-                break
-            speed = 0.4
-            turn = 0.05 * np.sin(t / 10 + robot)
-            pose = drive(pose, speed, turn, dt)
-            t = t + dt
-            odometry = rng.normal([speed, turn], [0.005, 0.0005])
-            sighting = sensor_at(pose).observe(target(t), rng=rng)
-            outlier = 8.0 * (rng.random() < 0.05)
-            rows.append([t, robot, dt, *odometry, *(sighting + outlier)])
-    np.savetxt(path, sorted(rows), delimiter=",")
+def sensor_of(robot: int) -> Any:
+    """The range-bearing sensor of a robot, whose pose is a part of the state."""
+    first = 4 + 3 * robot
+    return range_bearing((0, 1), std=STD, observer=range(first, first + 3))
 
 
-def read_log(path: Path) -> Iterator[filters.Observation]:
-    """Yield a log's sightings, each by a sensor where the robot's odometry puts it."""
-    poses = {robot: first_pose(robot) for robot in range(ROBOTS)}
-    rows = np.loadtxt(path, delimiter=",").tolist()
-    for t, robot, dt, speed, turn, *sighting in rows:
-        pose = drive(poses[robot], speed, turn, dt)
-        poses[robot] = pose
-        yield filters.Observation(
-            t, int(robot), sighting, sensor_at(pose), metadata=pose
-        )
+def move(x: np.ndarray, t: float, dt: float, odometry: Inputs) -> np.ndarray:
+    """Move states (..., 19): the target, then the poses by their odometry."""
+    poses = x[..., 4:].reshape(*x.shape[:-1], ROBOTS, 3)
+    for _, length, inputs in odometry.pieces(t, dt):
+        poses = drive(poses, inputs.reshape(ROBOTS, 2), length)
+    moved = x[..., :4] @ TARGET.F(dt).T
+    return np.concatenate([moved, poses.reshape(*x.shape[:-1], -1)], axis=-1)
 
 
-log = Path(tempfile.mkdtemp()) / "log.csv"
-simulate(log, np.random.default_rng(0))
-observations = list(read_log(log))
+def noise_cov(t: float, dt: float) -> np.ndarray:
+    """Process noise: of the target's velocity, and of the odometry."""
+    cov = np.zeros((4 + 3 * ROBOTS, 4 + 3 * ROBOTS))
+    cov[:4, :4] = TARGET.Q(t, dt)
+    speed, turn = np.square(ODOMETRY_STD)
+    cov[4:, 4:] = dt * np.diag([speed, speed, turn] * ROBOTS)
+    return cov
+
+
+log = Path(tempfile.mkdtemp())
+true_poses = simulate(log, np.random.default_rng(0))
+odometry = np.loadtxt(log / "odometry.csv", delimiter=",")
+inputs = Inputs(odometry[:, 0], odometry[:, 1:], np.zeros((10, 10)))
+names = [*TARGET.names]
+names += [f"{part}{robot}" for robot in range(ROBOTS) for part in ("x", "y", "heading")]
+model = Model(
+    len(names),
+    partial(move, odometry=inputs),
+    noise_cov,
+    names=tuple(names),
+    periods={name: 2 * np.pi for name in names if "heading" in name},
+)
+observations = [
+    filters.Observation(t, int(robot), seen)
+    for t, robot, *seen in np.loadtxt(log / "sightings.csv", delimiter=",").tolist()
+]
 times = np.unique([observation.t for observation in observations])
-model = constant_velocity(sigma=0.03)
-truth = dict(zip(model.names, target(times).T, strict=True))
+truth = dict(zip(TARGET.names, target(times).T, strict=True))
+mean = np.append(target(0.0), first_poses())
+cov = np.diag([4, 4, 0.1, 0.1, *np.tile(np.square(START_STD), ROBOTS)])
 
 # Outliers are gated; messages are exchanged every ten seconds only.
-sensors = [None] * ROBOTS  # each observation brings its own
+sensors = [sensor_of(robot) for robot in range(ROBOTS)]
 ring = graphs.ring(ROBOTS)
 options: dict[str, Any] = {"gate_probability": 0.999, "exchange_interval": 10.0}
 fuse = partial(target_fusion, target_dim=4)
 families: dict[str, Any] = {
     "mixture": filters.MixtureFilter(
-        model, sensors, ring, fusion=fuse, target_dim=4, **options
+        model, sensors, ring, fusion=fuse, target_dim=4, n_components=1, **options
     ),
-    "gaussian": filters.GaussianFilter(model, sensors, ring, lag=40, **options),
+    "gaussian": filters.GaussianFilter(model, sensors, ring, lag=30, **options),
     "ensemble": filters.EnsembleFilter(
-        model, sensors, ring, lag=40, members=100, **options
+        model, sensors, ring, lag=30, members=200, **options
     ),
     "increment": filters.InformationIncrementFilter(
         model, sensors, ring, target_dim=4, **options
@@ -108,11 +141,11 @@ families: dict[str, Any] = {
 }
 print("filter    error/m  NEES/d  rejected  floats")
 for name, f in families.items():
-    prior = (target(0.0), np.diag([4, 4, 0.1, 0.1]))
-    state = f.start(prior, rng=np.random.default_rng(1))
+    state = f.start((mean, cov), rng=np.random.default_rng(1))
     run = f.run(state, None, observations, truth=truth)
-    late = run.sel(time=slice(20, None))
-    error = np.sqrt(late["squared_error"][..., :2].sum("component").mean())
+    late = run.sel(time=slice(10, None))
+    squared = late["squared_error"].sel(component=list(TARGET.names[:2]))
+    error = np.sqrt(squared.sum("component").mean())
     nees = late["nees"].mean() / 4
     rejected = int(run["rejected"].sum())
     floats = int(run["scalars"].sum())

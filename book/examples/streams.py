@@ -6,7 +6,7 @@ import numpy as np
 from scipy import stats
 
 from distfilt.filters import GaussianFilter, Observation, ParticleFilter
-from distfilt.models import InputModel, Inputs, LinearModel, Model
+from distfilt.models import AgentModels, InputModel, Inputs, LinearModel, Model
 from distfilt.network import graphs
 from distfilt.sensors import LikelihoodSensor, Sensor, component
 
@@ -118,6 +118,23 @@ def odometry() -> Comparison:
     return state.covariances[0].diagonal(), by_hand
 
 
+def odometry_of_each_robot() -> Comparison:
+    """Two robots on a line; each measures its own speed, at times of its own."""
+    logs = [
+        Inputs([0.0], [[1.0]], [[0.01]]),
+        Inputs([0.0, 1.0], [[2.0], [0.5]], [[0.04]]),
+    ]
+    robots = [InputModel.from_inputs(1, lambda x, u, dt: x + u * dt, u) for u in logs]
+    team = AgentModels.from_models(robots)
+    f = GaussianFilter(team, [UNIT, None], share_observations=False)
+    state = f.step(f.start(PRIOR), 2.0, [[2.6], None])
+    # The first: x = 2 with variance 1 + 2² 0.01, then K = 1.04 / (1.04 + 1).
+    # The second: x = 2 + 0.5 with variance 1 + 0.04 + 0.04, and no observation.
+    gain = 1.04 / 2.04
+    by_hand = np.array([2.0 + gain * 0.6, 2.5, gain, 1.08])
+    return np.append(state.means[:, 0], state.covariances[:, 0, 0]), by_hand
+
+
 def likelihoods() -> Comparison:
     """Counts, an outlier in Student's t noise, noise that grows with distance."""
     models: list[Callable[[np.ndarray, np.ndarray], np.ndarray]] = [
@@ -154,11 +171,32 @@ def evidence() -> Comparison:
     return run[["log_likelihood", "nis"]].sum().to_array().values, by_hand
 
 
+def errors_of_own_places() -> Comparison:
+    """Each of two robots in one state is judged by its own place; the truth has a gap."""
+    f = GaussianFilter(STILL, [UNIT, component([1], std=1.0)], share_observations=False)
+    truth = {1.0: [0.5, 1.0], 2.0: [np.nan, np.nan], 3.0: [0.4, 1.2]}
+    y = np.array([[1.0], [1.0], [1.0]])
+    run = f.run(
+        f.start(([0.0, 0.0], np.eye(2))),
+        list(truth),
+        [y, 2 * y],
+        truth=lambda t: truth[t],
+        scored=[["0"], ["1"]],
+        keep=["nees"],
+    )
+    # After k observations of y the belief is N(k y / (k + 1), 1 / (k + 1)).
+    place = np.array([1.0, 2.0])
+    first = 2 * (place / 2 - truth[1.0]) ** 2
+    last = 4 * (3 * place / 4 - truth[3.0]) ** 2
+    return run["nees"].dropna("time").values.ravel(), np.append(first, last)
+
+
 EXACT = [delayed_observation, first_sight, restart, priors_of_agents]
-EXACT += [matrix_of_time, known_constant, odometry, evidence]
+EXACT += [matrix_of_time, known_constant, odometry, odometry_of_each_robot, evidence]
+EXACT += [errors_of_own_places]
 for recipe in [*EXACT, likelihoods]:
     library, by_hand = recipe()
     # Particles are draws; the others differ by rounding.
     tolerance = 1e-9 if recipe in EXACT else 0.02
     assert np.allclose(library, by_hand, rtol=0, atol=tolerance), recipe.__name__
-    print(f"{recipe.__name__:20s}", *library.round(3))
+    print(f"{recipe.__name__:23s}", *library.round(3))

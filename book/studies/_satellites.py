@@ -333,14 +333,14 @@ def time_series(name: str, error: np.ndarray, nees: np.ndarray) -> dict[str, flo
     return columns
 
 
-def stored_steps(s: Setup) -> range:
+def series_steps(s: Setup) -> range:
     """Return the steps at which `time_series` stores."""
     return range(EVERY - 1, s.times.size, EVERY)
 
 
 def time_columns(s: Setup, name: str) -> list[str]:
     """Return the names of the columns of `time_series`."""
-    return [f"{name}_{quantity}{k:03d}" for k in stored_steps(s) for quantity in "en"]
+    return [f"{name}_{quantity}{k:03d}" for k in series_steps(s) for quantity in "en"]
 
 
 def step_series(s: Setup, name: str, result: Any) -> dict[str, float]:

@@ -12,11 +12,9 @@ from typing import Any
 
 import numpy as np
 from _together_filters import (
-    GridFilter,
-    IteratedGaussian,
     LikelihoodConsensus,
     SharedPlanFilter,
-    TargetExchangeFilter,
+    SplitIntersection,
     average_on_tree,
     tree_graph,
 )
@@ -24,16 +22,20 @@ from _together_mixtures import BatchedMixtures
 from _together_problems import STUDY, THREE, Problem
 
 from distfilt import network
+from distfilt.density import Grid
 from distfilt.filters import (
     ChannelFilter,
     EnsembleFilter,
     Filter,
     GaussianFilter,
     GaussianSumFilter,
+    GridFilter,
     InformationConsensusFilter,
+    InformationIncrementFilter,
+    MixtureFilter,
     ParticleFilter,
 )
-from distfilt.mixtures import split_gaussian
+from distfilt.mixtures import split_gaussian, target_fusion
 from distfilt.network import covariance_intersection
 from distfilt.triangular import separable
 from distfilt.updates import (
@@ -66,6 +68,8 @@ class Cell:
         The values of the option that are tried.
     local : bool
         Whether agents filter their own problem [target; own position], if there is one.
+    one_by_one : bool
+        Whether the filter follows one run at a time.
     excluded : tuple of (str, str)
         Problems that this filter cannot have, each with the reason.
     """
@@ -76,6 +80,7 @@ class Cell:
     option: str = ""
     grid: tuple[float, ...] = ()
     local: bool = False
+    one_by_one: bool = False
     excluded: tuple[tuple[str, str], ...] = ()
 
     def why_excluded(self, name: str) -> str:
@@ -260,27 +265,40 @@ def make_channel_filter(p: Problem, value: float) -> Filter:
     return ChannelFilter(p.model, p.sensors, tree, inflation=value, on_error="keep")
 
 
-def target_maker(send_increments: bool) -> Maker:
-    """Return a maker of filters of [target; own position]."""
-
-    def make(p: Problem, value: float) -> Filter:
-        return TargetExchangeFilter(
-            p.local.model,
-            p.local.sensors,
-            p.graph,
-            send_increments=send_increments,
-            inflation=value,
-            on_error="keep",
-        )
-
-    return make
+def make_increments(p: Problem, value: float) -> Filter:
+    """Make filters of [target; own position] that send increments; nothing is tuned."""
+    local = p.local
+    return InformationIncrementFilter(
+        local.model, local.sensors, p.graph, target_dim=len(p.scored)
+    )
 
 
-def grid_maker(kind: Any = GridFilter, **options: Any) -> Maker:
+def make_target_intersection(p: Problem, value: float) -> Filter:
+    """Make filters of [target; own position] that intersect beliefs of the target."""
+    n = len(p.scored)
+    return MixtureFilter(
+        p.local.model,
+        p.local.sensors,
+        p.graph,
+        target_dim=n,
+        n_components=1,
+        max_components=1,
+        fusion=partial(target_fusion, target_dim=n),
+    )
+
+
+def square_grid(cells: int = 40) -> Grid:
+    """Return a grid on the square of 18 m in which the targets in the plane stay."""
+    return Grid((cells, cells), low=-9.0, high=9.0)
+
+
+def grid_maker(**options: Any) -> Maker:
     """Return a maker of grid filters, which have no tuned option."""
 
     def make(p: Problem, value: float) -> Filter:
-        return kind(p.model, p.sensors, p.graph, **options)
+        return GridFilter(
+            p.model, p.sensors, p.graph, grid=square_grid(), on_error="keep", **options
+        )
 
     return make
 
@@ -292,6 +310,11 @@ BY_TRACE = partial(covariance_intersection, rule="trace")
 FOUR_ROUNDS = partial(covariance_intersection, rounds=4)
 TWO_ROUNDS = partial(network.average_consensus, rounds=2)
 FOUR_AVERAGES = partial(network.average_consensus, rounds=4)
+TRIGGERED = partial(
+    network.event_triggered,
+    rounds=STUDY["triggered_rounds"],
+    threshold=STUDY["trigger"],
+)
 # Inflation below one serves underconfident filters, such as intersection.
 # The library accepts none below 0.5.
 INFLATION = (
@@ -421,7 +444,7 @@ KALMAN_CELLS = {
     "ekf_hops": Cell(EXTENDED, TWO_HOPS, gaussian_maker(hops=2), *INFLATION),
     # The mode of the posterior instead of one linearization.
     "iekf_flood": Cell(
-        ITERATED, FLOODED, gaussian_maker(IteratedGaussian, hops="all"), *INFLATION
+        ITERATED, FLOODED, gaussian_maker(hops="all", iterations=4), *INFLATION
     ),
     # Two messages on each of A - 1 links, whatever A.
     "ekf_tree": Cell(
@@ -480,6 +503,20 @@ KALMAN_CELLS = {
         *INFLATION,
         excluded=NO_UNION,
     ),
+    # Only the part of an error that may be common is discounted.
+    "ekf_split": Cell(
+        EXTENDED,
+        "beliefs, split CI",
+        gaussian_maker(SplitIntersection),
+        *INFLATION,
+    ),
+    # Eight rounds, in which an agent is silent while its value changes little.
+    "ekf_event": Cell(
+        EXTENDED,
+        "information, averaged when it changes",
+        consensus_maker("measurements", TRIGGERED),
+        *INFLATION,
+    ),
     # Unscented points instead of derivatives, with three rules of exchange.
     "ukf_near": Cell(
         UNSCENTED, NEAR, gaussian_maker(linearization="unscented"), *INFLATION
@@ -514,18 +551,18 @@ KALMAN_CELLS = {
     "news": Cell(
         "information increments",
         "increments, one hop",
-        target_maker(send_increments=True),
-        *INFLATION,
+        make_increments,
         local=True,
+        one_by_one=True,
         excluded=NO_INCREMENTS,
     ),
     # Agents do not keep the correlation of their positions with each other.
     "own_ci": Cell(
         "Kalman of target and own position",
         "beliefs of the target, equal CI",
-        target_maker(send_increments=False),
-        *INFLATION,
+        make_target_intersection,
         local=True,
+        one_by_one=True,
         excluded=NO_POSITION,
     ),
 }

@@ -302,9 +302,9 @@ def angles(s: Scenario = HELD, agents: int | None = None) -> Problem:
     """Agents along a road observe bearings of a walker; the graph is complete."""
     agents = agents or s["road_agents"]
     model = replace(models.constant_velocity(sigma=s["road_sigma"]), names=WALKER)
-    # Sensors stand on a road beside the target, so that no bearing wraps.
+    # Sensors stand on a road beside the target, which does not reach it: no bearing wraps.
     road = np.linspace(-6, 6, agents)
-    places = np.stack([road, np.full(agents, -8.0)], axis=-1)
+    places = np.stack([road, np.full(agents, -s["road_distance"])], axis=-1)
     std = s["angle_std"]
     bearings = [sensors.bearing((0, 1), std=std, origin=place) for place in places]
     return Problem(
@@ -312,7 +312,7 @@ def angles(s: Scenario = HELD, agents: int | None = None) -> Problem:
         model,
         bearings,
         graphs.complete(agents),
-        (np.zeros(4), np.diag([4.0, 4.0, 0.25, 0.25])),
+        (np.zeros(4), np.diag(np.square(s["road_prior_std"]))),
         observation_times(s),
         s["burn"],
         WALKER,

@@ -1,6 +1,7 @@
 """Results of chapter 11's stored studies: ratios, fronts, Holm's test, bills and operations.
 
-The decision tree that is learned from them stands in `_together_tree.py`.
+Most functions take `runs`, the first run and the one after the last that count: choices
+are made on one half of the runs and judged on the other.
 """
 
 from __future__ import annotations
@@ -22,6 +23,12 @@ CONSISTENT = (0.8, 1.25)
 """NEES per component of a filter that is called consistent; the text says where 0.95 to 1.05."""
 BUDGETS = (2, 5, 10, 20, 64)
 """Numbers that an agent may send in a step."""
+Runs = tuple[int, int]
+ALL: Runs = (0, together.STUDY["runs"])
+SIMULATED: Runs = (0, ALL[1] // 2)
+"""Runs on which filters are chosen."""
+JUDGED: Runs = (ALL[1] // 2, ALL[1])
+"""Runs on which the choices are judged."""
 TO_CENTRE = "observations to a centre, estimate back"
 CENTRES = {
     f"{family}_centre": replace(together.CELLS[f"{family}_flood"], exchange=TO_CENTRE)
@@ -78,8 +85,14 @@ def result(stored: Any, name: str, cell: str = "") -> Result:
 
 
 @cache
-def results(name: str) -> dict[str, Result]:
+def results(name: str, runs: Runs = ALL) -> dict[str, Result]:
     """Return all cells of a problem, the reference first, those with a centre last."""
+    if runs != ALL:
+        part = slice(*runs)
+        return {
+            cell: replace(r, error=r.error[part], nees=r.nees[part])
+            for cell, r in results(name).items()
+        }
     stored = studies.stored("together", "held" if name in THREE else "every")
     prefix = f"{name}_"
     cells = cells_in(stored, prefix)
@@ -181,6 +194,7 @@ FUSION_FACTORS = {
     "info": 8,
     "inverted": 25,
     "ellipsoid": 25,
+    "split": 50,
     "union": 250,
     "channel": 8,
 }
@@ -253,6 +267,7 @@ def count_kalman_operations(p: Any, cell: str, m: float, transition: float) -> f
         return SUMS[family] * (4 * d**3 + update + points)
     points = (2 * d + 1) * (transition + m * d) if family == "ukf" else 0
     rounds = {"two": 2, "icf": 4, "hcmci": 8, "meas": p.n_agents / 2, "tree": 2}
+    rounds["event"] = together.STUDY["triggered_rounds"]
     averaging = rounds.get(rule, 0) * near * d * d
     if rule in ("icf", "hcmci", "channel"):
         # Priors in the form of information and back
@@ -277,19 +292,19 @@ def count_ensemble_operations(
 # --------------------------------------------------------------------------- the best cells
 
 
-def admissible(name: str, budget: float = np.inf) -> list[Result]:
+def admissible(name: str, budget: float = np.inf, runs: Runs = ALL) -> list[Result]:
     """Return the consistent cells within a budget of numbers, counted link by link."""
     return [
         r
-        for cell, r in results(name).items()
+        for cell, r in results(name, runs).items()
         if cell not in ("reference", "half") and r.consistent and r.floats <= budget
     ]
 
 
 @cache
-def best(name: str, budget: float = np.inf) -> Result:
+def best(name: str, budget: float = np.inf, runs: Runs = ALL) -> Result:
     """Return the consistent cell of least error within a budget; of equal ones the cheapest."""
-    candidates = admissible(name, budget)
+    candidates = admissible(name, budget, runs)
     # Cells whose errors differ by rounding alone are equal.
     least = min(r.error.mean() for r in candidates)
     equal = [r for r in candidates if r.error.mean() < least * (1 + 1e-4)]
@@ -297,10 +312,10 @@ def best(name: str, budget: float = np.inf) -> Result:
 
 
 @cache
-def least_work(name: str, budget: float = np.inf) -> float:
+def least_work(name: str, budget: float = np.inf, runs: Runs = ALL) -> float:
     """Return the least operations of a consistent cell within ten percent of the best one."""
     p = together.problem(name)
     # Ten percent of error are 1.1² of squared error.
-    limit = best(name, budget).error.mean() * 1.1**2
-    close = [r for r in admissible(name, budget) if r.error.mean() <= limit]
+    limit = best(name, budget, runs).error.mean() * 1.1**2
+    close = [r for r in admissible(name, budget, runs) if r.error.mean() <= limit]
     return min(count_operations(p, r.cell) for r in close)

@@ -14,8 +14,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from _together_cells import CELLS, cell_names
-from _together_filters import GridFilter
+from _together_cells import CELLS, cell_names, square_grid
 from _together_problems import (
     BATCH,
     STUDY,
@@ -25,7 +24,7 @@ from _together_problems import (
     problem,
 )
 
-from distfilt.filters import GaussianFilter, ParticleFilter
+from distfilt.filters import GaussianFilter, GridFilter, ParticleFilter
 
 Array = np.ndarray
 Seed = np.random.SeedSequence
@@ -120,13 +119,15 @@ def mean_scores(p: Problem, run: Any) -> dict[str, Array]:
     means = late.mean(("time", "agent"), skipna=False)
     components = means.sel(component=list(p.scored))
     scores = {}
-    # The squared error is that of the whole position, or of the whole state.
+    # The squared error is that of the whole position, or of the whole state. A run that
+    # failed has none: by default NaN would count as zero.
     if "squared_error" in means:
-        scores["error"] = components["squared_error"].sum("component").values
+        errors = components["squared_error"].sum("component", skipna=False)
+        scores["error"] = errors.values
     if "nees" in means:
         scores["nees"] = means["nees"].values / len(p.scored)
     if "crps" in means:
-        scores["crps"] = components["crps"].sum("component").values
+        scores["crps"] = components["crps"].sum("component", skipna=False).values
     return scores
 
 
@@ -190,11 +191,15 @@ def measure(
 ) -> dict[str, float]:
     """Return a filter's errors and NEES run by run, and its floats; NaN where it fails."""
     name = prefix + cell
-    local = cell in CELLS and CELLS[cell].local
+    made = CELLS.get(cell)
+    local = made is not None and made.local
+    one_by_one = made is not None and made.one_by_one
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            scores = score_filter(p, f, data, stream(seed, name), local=local)
+            scores = score_filter(
+                p, f, data, stream(seed, name), local=local, one_by_one=one_by_one
+            )
         except (ValueError, ArithmeticError, RuntimeError) as error:
             print(f"{p.name}, {name}: {error}", file=sys.stderr)
             nan = np.full(data[0].shape[1], np.nan)
@@ -214,8 +219,10 @@ def references(p: Problem) -> dict[str, Any]:
         return {"reference": GaussianFilter(*central)}
     if p.model.dim == 2:
         return {
-            "reference": GridFilter(*central, cells=STUDY["reference_cells"]),
-            "half": GridFilter(*central),
+            "reference": GridFilter(
+                *central, grid=square_grid(STUDY["reference_cells"])
+            ),
+            "half": GridFilter(*central, grid=square_grid()),
         }
     many = STUDY["reference"]
     return {

@@ -48,14 +48,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
 
 columns = [f"{row}_{lost}_{m}" for row in ROWS for lost in LOSSES for m in METRICS]
 parameters = {"setting": paper.SETTING, "losses": LOSSES}
-code = (
-    paper.simulate,
-    paper.observe,
-    paper.prior_beliefs,
-    paper.make_filter,
-    paper.run_filter,
-    paper.score_epoch,
-)
+code = paper.run_code
 scenarios = paper.scenarios
 seeds = np.random.SeedSequence(900).spawn(96)
 rtol = 1e-3

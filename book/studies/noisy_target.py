@@ -89,15 +89,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
 
 columns = [f"{row}_{m}" for row in ROWS for m in (*METRICS, "floats")]
 parameters = {"setting": SETTING}
-code = (
-    run_joint,
-    paper.simulate,
-    paper.observe,
-    paper.prior_beliefs,
-    paper.make_filter,
-    paper.run_filter,
-    paper.score_epoch,
-)
+code = (*paper.run_code, run_joint)
 scenarios = paper.scenarios
 seeds = np.random.SeedSequence(1920).spawn(104)
 rtol = 1e-3

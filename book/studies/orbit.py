@@ -510,17 +510,21 @@ parameters = {
     "scenes": SCENES,
     "rows": {scene: [*rows, *joint_rows(scene)] for scene, rows in ROWS.items()},
 }
-code = (
-    fuse_reduced,
-    average_pair,
-    agent_sensor,
+# The functions behind one run, which other studies of these orbits use too
+run_code = (
     simulate,
     observe,
     prior_beliefs,
     make_filter,
     run_filter,
-    run_joint,
     score_epoch,
+)
+code = (
+    *run_code,
+    fuse_reduced,
+    average_pair,
+    agent_sensor,
+    run_joint,
     row_columns,
     run_scene,
 )

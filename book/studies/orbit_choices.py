@@ -146,17 +146,7 @@ parameters = {
     "setting": paper.SETTING,
     "choices": {name: ["none", *rules] for name, (_, _, rules) in CHOICES.items()},
 }
-code = (
-    with_components,
-    multiply_beliefs,
-    run_row,
-    paper.simulate,
-    paper.observe,
-    paper.prior_beliefs,
-    paper.make_filter,
-    paper.run_filter,
-    paper.score_epoch,
-)
+code = (*paper.run_code, with_components, multiply_beliefs, run_row)
 scenarios = paper.scenarios
 seeds = paper.seeds
 rtol = 1e-3

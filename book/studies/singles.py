@@ -96,17 +96,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
 
 columns = [f"{row}_{m}" for row in ("bound", *ROWS) for m in METRICS]
 parameters = {"setting": paper.SETTING, "rows": sorted(ROWS)}
-code = (
-    fuse_targets,
-    run_unscented,
-    paper.simulate,
-    paper.observe,
-    paper.prior_beliefs,
-    paper.make_filter,
-    paper.run_filter,
-    paper.run_joint,
-    paper.score_epoch,
-)
+code = (*paper.run_code, fuse_targets, run_unscented, paper.run_joint)
 scenarios = paper.scenarios
 seeds = np.random.SeedSequence(480).spawn(448)
 rtol = 1e-3

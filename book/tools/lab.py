@@ -30,18 +30,29 @@ from nbformat.sign import NotebookNotary
 from pybtex.database import BibliographyData, parse_file
 from pybtex.plugin import find_plugin
 
-from common import BOOK, ROOT, is_chapter, toc_pages
+from common import BOOK, ROOT, chapters, is_chapter, toc_pages
 from pages import chapter_label, chapter_number, reproductions_text
 
-ROLE = re.compile(r"\{(cite:p|cite:t|cite|eq|numref|ref|doc|prf:ref)\}`([^`]+)`")
+ROLE = re.compile(r"\{([a-z]+(?::[a-z]+)?)\}`([^`]+)`")
 MATH = re.compile(r"^(?P<fence>`{3,})\{math\}\n(?P<body>.*?)^(?P=fence)$", re.M | re.S)
 DOLLARS = re.compile(r"\$\$(?P<body>[^$]+?)\$\$ *\((?P<label>[\w-]+)\)", re.S)
 OPTION = re.compile(r"^:(\w+): *(.*)\n", re.M)
 TITLE = re.compile(r"^# +(.+)$", re.M)
 ANCHOR = re.compile(r"^\(([\w-]+)\)=\s*\n+#+ +(.+)$", re.M)
-SOLUTION = re.compile(
-    r"^(`{3,}|:{3,})\{solution-(start|end)\}[^\n]*\n.*?^\1$\n?", re.M | re.S
+GATE = re.compile(
+    r"^(?P<fence>`{3,}|:{3,})\{(?P<kind>exercise|solution)-(?P<side>start|end)\} *"
+    r"(?P<title>[^\n]*)\n.*?^(?P=fence)$\n?",
+    re.M | re.S,
 )
+"""The start or the end of an exercise or a solution with cells."""
+BOX = re.compile(
+    r"^(?P<fence>`{3,}|:{3,})\{(?P<kind>exercise|prf:algorithm|admonition)\} *(?P<title>[^\n]*)\n"
+    r"(?P<body>.*?)^(?P=fence)$",
+    re.M | re.S,
+)
+BOXES = {"exercise": "Exercise: ", "prf:algorithm": "Algorithm: ", "admonition": ""}
+LINK = re.compile(r"\[([^\[\]]+)\]\((?!https?:)[^()\s]+\.(?:ipynb|md)(?:#[^()\s]*)?\)")
+"""A link to another page."""
 INCLUDE = re.compile(r"^```\{include\} _generated/reproductions\.md\n```$", re.M)
 MADE = re.compile(r"^```\{include\} _generated/\S+\n```$", re.M)
 HELP = """# API reference
@@ -50,6 +61,15 @@ The reference is a page of the built book (`make book`). In a notebook `help(nam
 the same text: arguments with shapes and units, errors, and an example.
 `book/examples` has a filter of your own in sixty lines.
 """
+INSTALL = """This is a page of *Distributed Nonlinear Filtering*, {title}. It needs Python 3.11 or newer, and from a copy of the
+book's repository the library and the book's kit, which reads the data there:
+
+```sh
+pip install '.[maps,reference]' 'sgp4>=2.23'
+pip install -e book/kit
+```
+
+Then it runs from any folder."""
 HIDDEN = {"hide-input", "remove-input", "remove-cell", "hide-cell"}
 
 
@@ -161,6 +181,10 @@ def render_role(
     # A target may be a path of a page, or a label.
     label = label.removeprefix("/").removeprefix("book/").removesuffix(".md")
     words = text.strip() or all_names.words.get(label, label)
+    # A name of the library is code, without its path after "~".
+    if role.startswith("py:"):
+        shown = label.rpartition(".")[2] if label.startswith("~") else label
+        return f"`{text.strip() or shown}`"
     home = all_names.homes.get(label, page)
     # A label of the same page needs no link.
     return words if home == page else f"[{words}]({file_of(home)})"
@@ -183,10 +207,22 @@ def plain(text: str, page: str, all_names: Names, references: BibliographyData) 
     def dollars(match: re.Match[str]) -> str:
         return f"$${match['body']}\\tag{{{all_names.equations[match['label']]}}}$$"
 
+    def gate(match: re.Match[str]) -> str:
+        # JupyterLab cannot fold a solution: it gets a heading.
+        if match["side"] == "end":
+            return ""
+        if match["kind"] == "solution":
+            return "**Solution**\n"
+        return f"**{BOXES['exercise']}{match['title']}**\n"
+
+    def box(match: re.Match[str]) -> str:
+        head = f"**{BOXES[match['kind']]}{match['title']}**"
+        return f"{head}\n\n{OPTION.sub('', match['body']).strip()}\n"
+
     # Equations first: their numbers come from labels that are removed here.
     text = MATH.sub(equation, DOLLARS.sub(dollars, text))
-    # JupyterLab cannot fold a solution: it gets a heading.
-    text = SOLUTION.sub(lambda m: "**Solution**\n" if m[2] == "start" else "", text)
+    text = BOX.sub(box, text)
+    text = GATE.sub(gate, text)
     text = INCLUDE.sub(lambda m: reproductions_text(), text)
     # Parts that the build computes are files of the built book only.
     text = MADE.sub(
@@ -232,6 +268,38 @@ def notebook(source: Path, all_names: Names, references: BibliographyData) -> An
     return stored
 
 
+def download(source: Path, all_names: Names, references: BibliographyData) -> Any:
+    """Return a chapter as a notebook that is read alone: how to install, and no links to pages."""
+    alone = notebook(source, all_names, references)
+    for cell in alone.cells:
+        if cell.cell_type == "markdown":
+            cell.source = LINK.sub(r"\1", cell.source)
+    text = INSTALL.format(title=all_names.words[source.stem])
+    cell_id = f"{source.stem}-install"
+    alone.cells.insert(0, nbformat.v4.new_markdown_cell(text, id=cell_id))
+    return alone
+
+
+def read_references() -> BibliographyData:
+    """Return the book's bibliography."""
+    return parse_file(str(BOOK / "refs.bib"), bib_format="bibtex")
+
+
+def downloadable() -> list[Path]:
+    """Return the numbered chapters, whose pages offer a notebook."""
+    return [source for source in chapters() if chapter_number(f"book/{source.stem}")]
+
+
+def write_downloads(folder: Path) -> None:
+    """Write the notebooks that the pages offer."""
+    folder.mkdir(parents=True, exist_ok=True)
+    all_names = names([ROOT / f"{page}.md" for page in toc_pages()])
+    references = read_references()
+    for source in downloadable():
+        alone = download(source, all_names, references)
+        nbformat.write(alone, folder / f"{source.stem}.ipynb")
+
+
 def bibliography(references: BibliographyData) -> str:
     """Return the list of references as Markdown."""
     # The style and the order of the book's own bibliography
@@ -247,7 +315,7 @@ def copy(folder: Path) -> list[Path]:
     pages = [
         ROOT / f"{page}.md" for page in toc_pages() if (ROOT / f"{page}.md").is_file()
     ]
-    references = parse_file(str(BOOK / "refs.bib"), bib_format="bibtex")
+    references = read_references()
     all_names = names(pages)
     book = folder / "book"
     notebooks = []

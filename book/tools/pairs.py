@@ -3,8 +3,8 @@ stored.
 
     python book/tools/pairs.py [CHAPTER ...]
 
-jupytext does not compare the two files, and nbval accepts a notebook whose outputs and execution
-counts were both cleared.
+nbval accepts a notebook whose outputs and execution counts were both cleared, so that these are
+checked here too.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import nbformat
+from jupytext.compare import compare_cells
 
 from common import (
     BOOK,
@@ -38,18 +39,18 @@ WIDTH = 79
 def differences(source: Path, stored: Any) -> list[str]:
     """Describe the differences between the cells of the Markdown and of the notebook."""
     fresh = read(source)
-    problems = []
-    if len(fresh.cells) != len(stored.cells):
-        problems.append(
-            f"{len(fresh.cells)} cells in the Markdown, {len(stored.cells)} stored"
-        )
-    for ours, theirs in zip(fresh.cells, stored.cells, strict=False):
-        # Outputs and execution counts are the notebook's own.
-        for key in ("id", "cell_type", "source", "metadata"):
-            if ours.get(key) != theirs.get(key):
-                problems.append(
-                    f"{ours['id']}: {key} differs between the Markdown and the notebook"
-                )
+    # Outputs and execution counts are the notebook's own.
+    cells, keys = compare_cells(
+        stored.cells,
+        fresh.cells,
+        raise_on_first_difference=False,
+        compare_outputs=False,
+    )
+    differs = "differs between the Markdown and the notebook"
+    problems = [f"{key} of a cell {differs}" for key in sorted(keys)]
+    if cells:
+        numbers = ", ".join(map(str, sorted(cells)))
+        problems.append(f"a cell's source, type or id {differs}, in {numbers}")
     # The state of widgets is an output, so it is the notebook's own.
     if fresh.metadata != {k: v for k, v in stored.metadata.items() if k != "widgets"}:
         problems.append("the headers of the Markdown and of the notebook differ")

@@ -1,6 +1,11 @@
 """Densities on grids: kernel estimates, the Fokker-Planck equation, and their Kalman filter."""
 
-from .consensus import ConsensusProtocol, DynamicAverage, PIConsensus
+from .consensus import (
+    BiasedAverage,
+    ConsensusProtocol,
+    DynamicAverage,
+    PIConsensus,
+)
 from .flooding import Centralised, Flooding, Neighbours
 from .fokker_planck import FokkerPlanck, bernoulli
 from .grid import Grid, zero_mean_prior
@@ -21,6 +26,7 @@ from .low_rank import (
 )
 
 __all__ = [
+    "BiasedAverage",
     "Centralised",
     "Dense",
     "DynamicAverage",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from ..network import Channel, Graph, PIState, pi_step
+from ..network import Channel, Faults, Graph, PIState, pi_step
 from ..network import weights as weighting
 from ..network.channel import LossRule
 from ..validation import (
@@ -18,9 +19,11 @@ from ..validation import (
     PositiveInt,
     call_user,
 )
+from ..validation.first_use import mark_checked, needs_check
 from .snapshot import SwarmSnapshot
 
 __all__ = [
+    "BiasedAverage",
     "ConsensusProtocol",
     "DynamicAverage",
     "PIConsensus",
@@ -89,7 +92,10 @@ def estimate_without_messages(
 
 
 def _encode(snapshot: SwarmSnapshot, modes: int | None, densities: Array) -> Array:
-    """Densities or their cosine coefficients, and an indicator of the first present agent."""
+    """Return the numbers that the agents average, (A, k + 1).
+
+    Densities (A, n) or their k cosine coefficients, and the indicator of the first present agent.
+    """
     values = densities
     if modes is not None:
         values = densities @ snapshot.grid.cosines(modes) * snapshot.grid.volume
@@ -101,7 +107,7 @@ def _encode(snapshot: SwarmSnapshot, modes: int | None, densities: Array) -> Arr
 def _decode(
     values: Array, snapshot: SwarmSnapshot, modes: int | None
 ) -> tuple[Array, Array]:
-    """Densities and numbers of agents from averaged values, the inverse of `_encode`."""
+    """Return densities (A, n) and numbers of agents (A,) from averages: `_encode` inverted."""
     densities = values[:, :-1]
     if modes is not None:
         densities = densities @ snapshot.grid.cosines(modes).T
@@ -140,7 +146,11 @@ class PIConsensus(FrozenModel, ConsensusProtocol):
     initial_std: PositiveFloat | None = field(default=None, kw_only=True)
 
     def initial_state(self, snapshot: SwarmSnapshot) -> Memory:
-        """Initial estimates, integrals of zero, and the present inputs."""
+        """Return estimates, integrals and inputs of the estimator, each (A, k + 1).
+
+        k is the number of cells or of cosine coefficients; the last column counts the agents. The
+        integrals are zero, and the inputs those of the present positions.
+        """
         inputs = _encode(snapshot, self.modes, snapshot.kernels)
         estimates = inputs
         if self.initial_std is not None:
@@ -170,13 +180,22 @@ class PIConsensus(FrozenModel, ConsensusProtocol):
         return (state.estimate, state.integral, inputs), densities, agents
 
 
+class BiasedAverage(RuntimeWarning):
+    """An average whose sum lost messages change, so that it is another one than asked for.
+
+    >>> issubclass(BiasedAverage, RuntimeWarning)
+    True
+    """
+
+
 @dataclass(frozen=True)
 class DynamicAverage(FrozenModel, ConsensusProtocol):
     """First-order dynamic average consensus on cosine coefficients of the density.
 
     Metropolis weights if all links are bidirectional, otherwise weights that balance the graph
-    (M. Zhu and S. Martinez, Automatica 46 (2010) 322-329). On one-way links, losses move the
-    average.
+    (M. Zhu and S. Martinez, Automatica 46 (2010) 322-329). On one-way links lost messages move
+    the average for good, of which :class:`BiasedAverage` warns once; :class:`Flooding` is not
+    moved by losses.
 
     Parameters
     ----------
@@ -210,8 +229,22 @@ class DynamicAverage(FrozenModel, ConsensusProtocol):
         # With links both ways a lost message cancels its answer too, which keeps the sum of the
         # estimates. One-way links cannot: the receiver keeps its own value, and the sum moves.
         on_loss: LossRule = "keep" if graph.is_directed else "mutual"
+        if graph.is_directed:
+            self._warn_of_bias(channel.faults)
         # x ← W x + (u - u_previous) conserves mean(x) = mean(u), as the columns of W sum to one.
         mixed = channel.mix(estimates, weights, on_loss=on_loss)
         estimates = mixed + (inputs - previous)
         densities, n_agents = _decode(estimates, snapshot, self.modes)
         return (estimates, inputs), densities, n_agents
+
+    def _warn_of_bias(self, faults: Faults) -> None:
+        """Warn, once for each rule, that lost messages move the sum of the estimates."""
+        if faults.is_perfect or not needs_check(self, "losses"):
+            return
+        mark_checked(self, "losses")
+        warnings.warn(
+            "faults must not lose messages on one-way links for a DynamicAverage, whose estimates "
+            "drift away from the average with each loss: use links both ways, or Flooding",
+            BiasedAverage,
+            stacklevel=4,
+        )

@@ -122,6 +122,7 @@ class FokkerPlanck(FrozenModel):
 
     @cached_property
     def _faces(self) -> _Faces:
+        """The faces between neighbouring cells, those across the first axis first."""
         grid = self.grid
         cells = np.arange(grid.size).reshape(grid.shape)
         # A face lies between a cell and the next along its axis.

@@ -172,8 +172,7 @@ class LowRank(FrozenModel):
     @property
     def estimates(self) -> Array:
         """Every filter's density, (F, n)."""
-        # base + S M⁻¹ b
-        # Solved for all filters at once, without an inverse.
+        # p = base + S M⁻¹ b, solved for all filters at once
         weights = np.linalg.solve(self.information, self.vector[..., None])
         return np.asarray(self.base + (self.basis @ weights)[..., 0])
 
@@ -185,7 +184,7 @@ class LowRank(FrozenModel):
     @property
     def factors(self) -> Array:
         """Every filter's factor L of the covariance L Lᵀ, (F, n, r)."""
-        # With M = C Cᵀ, P = S M⁻¹ Sᵀ = L Lᵀ for Lᵀ = C⁻¹ Sᵀ.
+        # P = S M⁻¹ Sᵀ. With the Cholesky factor of M = C Cᵀ it is L Lᵀ for Lᵀ = C⁻¹ Sᵀ.
         root = np.linalg.cholesky(self.information)
         rows = np.broadcast_to(self.basis.mT, (len(root), *self.basis.mT.shape[-2:]))
         return np.linalg.solve(root, rows).mT
@@ -325,6 +324,7 @@ def low_rank_step(
 
 
 def _check_condition(information: Array) -> None:
+    """Refuse information matrices (F, r, r) that are too close to singular."""
     eigenvalues = np.linalg.eigvalsh(information)
     least = eigenvalues[:, 0]
     greatest = eigenvalues[:, -1]

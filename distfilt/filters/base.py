@@ -31,7 +31,7 @@ from typing import (
 
 import numpy as np
 
-from ..models import LinearModel, Model
+from ..models import AgentModels, LinearModel, Model
 from ..network import Channel, Faults, Ledger
 from ..network.channel import kind_of_rule
 from ..network.graphs import Graph, as_graph
@@ -43,6 +43,7 @@ from ..validation import (
     FrozenModel,
     InvalidArgumentError,
     Rng,
+    all_finite,
     format_number,
     skip_validation,
     validated,
@@ -53,7 +54,16 @@ from .failures import RECOVERABLE, FilterError, is_argument_error
 from .observations import Observation, match_delayed, read_observations
 from .plans import TimesArgument, find_degrees, plan_steps
 from .priors import Prior
-from .record import SCORES, Score, Summary, Truth, final_state, record_run
+from .record import (
+    SCORES,
+    Recording,
+    Score,
+    Scored,
+    Summary,
+    Truth,
+    final_state,
+    record_run,
+)
 from .repetition import drop_repeated
 from .resets import Reset, read_reset
 from .states import SensorState, State
@@ -448,6 +458,8 @@ class Filter(FrozenModel, ABC, Generic[S]):
         *,
         truth: Truth = None,
         scores: Collection[Score] = SCORES,
+        scored: Scored = None,
+        keep: Collection[str] | None = None,
         delayed: Sequence[Observation] = (),
     ) -> xarray.Dataset:
         """Step through a series, or through events, and record it.
@@ -461,13 +473,20 @@ class Filter(FrozenModel, ABC, Generic[S]):
             there is a step at each of their times too, and None is enough if none is delayed.
         observations : sequence of length A, or of Observation
             Per agent (T, *runs, m) or (T, m), or None; NaN marks a missing component. Or events in
-            any order, several of which may have the same time.
-        truth : array_like, (T, *runs, d) or (T, *runs, A, d), or mapping, optional
+            any order, several of which may have the same time; an empty list is a run without any.
+        truth : array_like, (T, *runs, d) or (T, *runs, A, d), callable or mapping, optional
             If given, the scores are recorded too. The truth is the same for all agents, or each
             agent's own, or it has some components only, by their names, (T, *runs) or
-            (T, *runs, A) each.
+            (T, *runs, A) each. NaN where it is unknown, as are the scores. A function of the time
+            in s, ``truth(t)``, serves as such a series.
         scores : collection of {"squared_error", "nees", "crps"}
             Which of them; CRPS costs about as much as an ensemble filter.
+        scored : sequence of str, or a sequence of them for each agent, optional
+            The components that ``nees`` and ``total_squared_error`` take together, such as those
+            of a robot's own pose; all whose truth is given by default.
+        keep : collection of str, optional
+            The variables that are recorded, and the mean; all by default. Without the covariances
+            long runs need far less memory.
         delayed : sequence of Observation
             Each is assimilated at the first of `times` not before its `arrival_time`. Its own time
             may lie between two of them.
@@ -479,14 +498,16 @@ class Filter(FrozenModel, ABC, Generic[S]):
             ``component``; units and meaning are in the attributes. ``mean``, ``variance`` and,
             with `truth`, ``squared_error`` and ``crps`` for each component; ``spread`` and
             ``total_squared_error`` add components up, whatever their units, and say so; ``nees``
-            is d on average for a consistent filter. ``messages``, ``scalars``, ``bytes``, ``lost``
-            and ``rounds`` are those of each step, the same names with ``_total`` their sums;
-            ``unseen`` counts the observations that an agent cannot use, since its sensor cannot
-            see from its belief; ``rejected`` counts those that the gate rejects; with
-            `record_evidence` ``log_likelihood``, ``nis`` and ``n_observed`` score the others.
+            is the number of its components on average for a consistent filter. ``messages``,
+            ``scalars``, ``bytes``, ``lost`` and ``rounds`` are those of each step, the same names
+            with ``_total`` their sums; ``unseen`` counts the observations that an agent cannot
+            use, since its sensor cannot see from its belief; ``rejected`` counts those that the
+            gate rejects; with `record_evidence` ``log_likelihood``, ``nis`` and ``n_observed``
+            score the others.
             :func:`distfilt.filters.final_state` returns the state at the end.
         """
-        return self._record(state, times, observations, truth, scores, delayed, 0)
+        recording = Recording(truth, scores, scored, keep)
+        return self._record(state, times, observations, recording, delayed, 0)
 
     def final_state(self, run: xarray.Dataset) -> S:
         """Return the state in which a run of this filter ended."""
@@ -500,8 +521,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         state: S,
         times: TimesArgument,
         observations: object,
-        truth: Truth,
-        scores: Collection[Score],
+        recording: Recording,
         delayed: Sequence[Observation],
         lag: int,
     ) -> xarray.Dataset:
@@ -511,7 +531,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         states = self._iterate(state, grid, entries, delayed, reuse_rng=True)
         # Without a lag every state is its own smoothed one.
         smoothed = _smooth_states(states, lag)
-        return record_run(self, grid, state, smoothed, truth, scores)
+        return record_run(self, grid, state, smoothed, recording)
 
 
 @dataclass(frozen=True, eq=False)
@@ -521,7 +541,8 @@ class SensorFilter(Filter[S]):
     Parameters
     ----------
     model : Model
-        The motion of the state; known to all agents.
+        The motion of the state, known to all agents; or
+        :class:`~distfilt.models.AgentModels`, one for each.
     sensors : sequence of length A
         Each agent's Sensor, or several of them in a list, or None. Neighbours know each other's.
         Of several sensors, each observation is an :class:`Observation` that names its sensor; one
@@ -532,7 +553,7 @@ class SensorFilter(Filter[S]):
     gate_probability : float, optional
         How likely a good observation passes the gate, in (0, 1); no gate by default. Each
         sensor's observation is tested against its prediction; the record counts the ``rejected``
-        ones.
+        ones, and a warning is given once if the last ten of a sensor are rejected.
     faults, names
         As for :class:`~distfilt.filters.Filter`.
 
@@ -564,10 +585,12 @@ class SensorFilter(Filter[S]):
 
     supports_increments: ClassVar[bool] = False
     supports_likelihoods: ClassVar[bool] = False
+    supports_agent_models: ClassVar[bool] = False
 
     def check_parts(self) -> None:
         """Refuse sensors or a graph that this family cannot use."""
         super().check_parts()
+        self._check_agent_models()
         if not self.supports_increments and self.change_sources:
             raise ValueError(
                 "sensors must not be increments here: this filter keeps no previous state"
@@ -587,6 +610,26 @@ class SensorFilter(Filter[S]):
             object.__setattr__(self, "graph", graph)
         if self.exchange_interval is not None and self.sends_observations:
             self._check_waiting()
+
+    def _check_agent_models(self) -> None:
+        """Refuse models of the agents where all need one, or that are not as many."""
+        model = self.model
+        if not isinstance(model, AgentModels):
+            return
+        if not self.supports_agent_models:
+            raise ValueError(
+                f"model must be one for all agents of a {type(self).__name__}, got AgentModels: "
+                "use GaussianFilter, EnsembleFilter or ParticleFilter"
+            )
+        if model.n_agents != self.n_agents:
+            raise ValueError(
+                f"model must have one for each of {self.n_agents} agents, got {model.n_agents}"
+            )
+
+    def model_of_states(self, runs: tuple[int, ...]) -> Model:
+        """Return the model of states (*runs, A, ..., d)."""
+        model = self.model
+        return model.at_axis(len(runs)) if isinstance(model, AgentModels) else model
 
     def check_likelihood(self, sensor: Sensor) -> None:
         """Refuse a sensor that is a likelihood, where the noise is taken as Gaussian."""
@@ -738,9 +781,13 @@ class SensorFilter(Filter[S]):
         """
         self.check_state(state)
         names, _ = self.components
-        return self.reset_belief(
-            state, read_reset(components, value, cov, agents, names, self.n_agents)
-        )
+        reset = read_reset(components, value, cov, agents, names, self.n_agents)
+        if state.rejection_streaks is not None:
+            # What the former belief rejected says nothing about the new one.
+            streaks = state.rejection_streaks.copy()
+            streaks[..., reset.agents, :, :] = 0.0
+            state = state.replace(rejection_streaks=streaks)
+        return self.reset_belief(state, reset)
 
     def reset_belief(self, state: S, reset: Reset) -> S:
         """Return the state with the new belief; a family that can do so extends it."""
@@ -775,18 +822,44 @@ class SensorFilter(Filter[S]):
         sizes = self.observation_sizes
         if type(observations) is not list or len(observations) != len(sizes):
             return read_observations(self, observations, runs, t)
-        # Nearly always every agent has one finite float64 array of the right shape.
-        result = []
-        for agent, (value, size) in enumerate(zip(observations, sizes, strict=True)):
+        # Nearly always every agent has one finite float64 array of the right shape, or
+        # events that fit their sensors.
+        result: list[list[Observation]] = []
+        for agent, (entry, size) in enumerate(zip(observations, sizes, strict=True)):
+            if entry is None:
+                result.append([])
+                continue
+            if type(entry) is list:
+                if not all([self._fits(o, agent, runs, t) for o in entry]):
+                    return read_observations(self, observations, runs, t)
+                result.append(list(entry))
+                continue
             if (
-                type(value) is not np.ndarray
-                or value.dtype != _FLOAT64
-                or value.shape != (*runs, size)
-                or np.count_nonzero(np.isfinite(value)) < value.size
+                type(entry) is not np.ndarray
+                or entry.dtype != _FLOAT64
+                or entry.shape != (*runs, size)
+                or np.count_nonzero(np.isfinite(entry)) < entry.size
             ):
                 return read_observations(self, observations, runs, t)
-            result.append([Observation.construct(t, agent, value)])
+            result.append([Observation.construct(t, agent, entry)])
         return result
+
+    def _fits(
+        self, observation: object, agent: int, runs: tuple[int, ...], t: float
+    ) -> bool:
+        """Whether an event is a complete observation of this time by a sensor of the agent."""
+        if type(observation) is not Observation:
+            return False
+        number = observation.sensor
+        sensors = self.agent_sensors[agent]
+        if type(number) is not int or number >= len(sensors):
+            return False
+        if observation.agent != agent or observation.t != t:
+            return False
+        if observation.arrival_time is not None and observation.arrival_time > t:
+            return False
+        value = observation.value
+        return value.shape == (*runs, sensors[number].dim) and all_finite(value)
 
 
 def require_rng(rng: Rng | None) -> Rng:

@@ -174,7 +174,8 @@ def insert_gaussian(
     after = slice((n - 1 - place) * d, (n - place) * d)
     before = slice((n - place) * d, (n - place + 1) * d)
     std = deviations(cov[..., before, before])
-    law = bridge_states(f.model, mean[..., before], (start, t_obs, end), std)
+    model = f.model_of_states(state.runs)
+    law = bridge_states(model, mean[..., before], (start, t_obs, end), std)
     innovation = wrap_differences(mean[..., after] - law.after, f.periods)
     new_mean = law.forecast + (law.gain @ innovation[..., None])[..., 0]
     # x(τ) = (F₁ - G F₂ F₁) x₀ + G x₁ + e
@@ -214,7 +215,7 @@ def insert_members(
     # Steps of members draw, so that their states have a generator.
     rng = copy_rng(require_rng(state.rng))
     drawn = draw_bridge(
-        f.model,
+        f.model_of_states(state.runs),
         beliefs[place - 1],
         beliefs[place],
         (start, t_obs, end),

@@ -222,6 +222,8 @@ class EnsembleFilter(
     update: Callable[..., Array] = enkf
     forecast: Callable[..., Array] = stochastic_forecast
 
+    supports_agent_models: ClassVar[bool] = True
+
     def check_parts(self) -> None:
         """Refuse an update of another signature, such as a wrapper without its update."""
         super().check_parts()
@@ -308,7 +310,7 @@ class EnsembleFilter(
         if step.dt:
             # Every member moves with the model and meets a draw of its noise.
             ensembles = call_user(
-                self.forecast, ensembles, self.model, state.t, step.dt, rng=step.rng
+                self.forecast, ensembles, step.model, state.t, step.dt, rng=step.rng
             )
             _check_shape(ensembles, "forecast", state.ensembles.shape)
             if self.periods:
@@ -316,7 +318,7 @@ class EnsembleFilter(
                 ensembles = fold_torn(ensembles, self.periods)
             if self.notices_wrapping:
                 warn_of_wrapping(
-                    self.model, state.ensembles, ensembles, state.t, step.dt
+                    step.model, state.ensembles, ensembles, state.t, step.dt
                 )
         # The ensembles of the earlier times that are kept, and now.
         stack = step.stack(step.check_forecast(ensembles, state.ensembles))

@@ -15,13 +15,18 @@ import numpy as np
 from ..network import Channel
 from ..network.channel import Payload
 from ..sensors import Sensor
-from ..validation import Array, Indices, call_user, check_array, format_number
+from ..validation import (
+    Array,
+    Indices,
+    call_user,
+    check_array,
+    format_number,
+)
 from .flooding import flood_observations
 from .observations import Observation, sensor_of
 from .states import SensorState
 
 if TYPE_CHECKING:
-    from .changes import References
     from .states import AnyState
     from .step import Step
 
@@ -51,6 +56,8 @@ def collect_observations(step: Step[AnyState]) -> Known:
     has_waited = bool(cast(SensorState, step.state).pending)
     sent_labels = _label(step, sent) if has_waited else own_labels
     by_time: Known = {}
+    # Most filters have neither a gate nor sensors of changes.
+    is_noted = step.streaks is not None or step.references is not None
     for agent, messages in enumerate(inbox):
         # In order of the senders, so that all agents with the same set have the same order.
         for sender in sorted((agent, *messages)):
@@ -63,8 +70,8 @@ def collect_observations(step: Step[AnyState]) -> Known:
                 listed = sent[sender]
                 payload = messages[sender]
                 values = list(payload) if isinstance(payload, tuple) else [payload]
-            if step.references is not None:
-                _receive_changes(step.references, step.t, agent, listed)
+            if is_noted:
+                _note_received(step, agent, listed)
             # The part behind the values counts as communication alone.
             for (t, sensor), value in zip(times_and_sensors, values, strict=False):
                 if t not in by_time:
@@ -73,13 +80,17 @@ def collect_observations(step: Step[AnyState]) -> Known:
     return by_time
 
 
-def _receive_changes(
-    references: References, t: float, agent: int, observations: list[Observation]
+def _note_received(
+    step: Step[AnyState], agent: int, observations: list[Observation]
 ) -> None:
-    """Note which sensors' observations of the present time an agent has."""
-    for observation in observations:
-        if observation.t == t:
-            references.receive(agent, observation)
+    """Note whose observations an agent has: for its gate, and for sensors of changes."""
+    if step.streaks is not None:
+        for observation in observations:
+            step.streaks.note(observation.t, agent, observation)
+    if step.references is not None:
+        for observation in observations:
+            if observation.t == step.t:
+                step.references.receive(agent, observation)
 
 
 def _choose_outgoing(
@@ -220,9 +231,11 @@ def fuse_beliefs(step: Step[AnyState], values: tuple[Array, ...]) -> tuple[Array
     The rule gets all runs at once. If it raises, each run is fused alone. Failed runs keep their
     values.
     """
-    # A failed run's values may make the rule fail again, so those of a good run stand in.
-    good = tuple(np.argwhere(~step.failed)[0])
-    inputs = [step.keep_failed(v, v[good]).copy() for v in values]
+    inputs = [v.copy() for v in values]
+    if step.any_failed:
+        # A failed run's values may make the rule fail again, so those of a good run stand in.
+        good = tuple(np.argwhere(~step.failed)[0])
+        inputs = [step.keep_failed(v, v[good]) for v in inputs]
     run_numbers = np.arange(math.prod(step.runs)).reshape(step.runs)
     channel = step.channel
     ledger = channel.ledger

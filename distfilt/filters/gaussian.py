@@ -226,7 +226,7 @@ class GaussianFamily(
     def _forecast(self, step: Step[GaussianState]) -> tuple[Array, Array]:
         """Return the joint mean and covariance of the forecast and the earlier states kept."""
         state = step.state
-        model = self.model
+        model = step.model
         dt = step.dt
         if not dt:
             return state.joint_means.copy(), state.joint_covariances.copy()
@@ -268,7 +268,7 @@ class GaussianFamily(
         self, step: Step[GaussianState], means: Array, covs: Array
     ) -> Array:
         """Return the derivative of the model's step at means (..., d)."""
-        model = self.model
+        model = step.model
         std = None
         if not isinstance(model, LinearModel) and needs_differences(model):
             # Differences are scaled by the state's standard deviations.
@@ -278,9 +278,10 @@ class GaussianFamily(
     def _step_points(self, step: Step[GaussianState], points: Array) -> Array:
         """Move points (..., N, d) without noise, on one branch."""
         t = step.state.t
-        moved = step_members(self.model, points, t, step.dt)
-        if self.notices_wrapping:
-            warn_of_wrapping(self.model, points, moved, t, step.dt)
+        moved = step_members(step.model, points, t, step.dt)
+        # A single point is on one branch by itself.
+        if self.notices_wrapping and points.shape[-2] > 1:
+            warn_of_wrapping(step.model, points, moved, t, step.dt)
         return moved
 
     def _linearize(
@@ -412,11 +413,10 @@ class GaussianFamily(
             predict, group.jacobian, mean, cov, linear
         )
         if not linear:
-            # Mostly everything is seen, and each number depends on the state: 0 < Σ |H| < ∞.
-            # NaN, where the prediction is, is not above zero.
-            steepness = np.abs(slope).sum(axis=-1) + 0.0 * predicted
-            is_seen = (steepness > 0) & (steepness < np.inf)
-            if np.count_nonzero(is_seen) < is_seen.size:
+            # Mostly everything is seen, and each number depends on the state: 0 < Σ H² < ∞.
+            steepness = np.vecdot(slope, slope)
+            is_steep = np.count_nonzero(steepness) == steepness.size
+            if not (is_steep and all_finite(steepness) and all_finite(predicted)):
                 predicted = self._leave_out_unseen(predicted, slope, group, step)
 
         def moments(_: Array) -> tuple[Array, Array]:
@@ -478,7 +478,8 @@ class GaussianFamily(
         fused_mean = fused_mean + (mean - common) if self.periods else fused_mean
         variance = np.diagonal(fused_cov, axis1=-2, axis2=-1)
         # A variance that is negative by rounding alone is small beside the largest one.
-        if (variance < -1e-9 * np.abs(variance).max()).any():
+        smallest = variance.min()
+        if smallest < 0 and smallest < -1e-9 * np.abs(variance).max():
             raise ValueError(
                 f"fusion must return a covariance, got a variance of {variance.min():g}"
             )
@@ -552,6 +553,7 @@ class GaussianFilter(
     iterations: PositiveInt = 1
 
     belief_kind: ClassVar[str | None] = "gaussians"
+    supports_agent_models: ClassVar[bool] = True
 
     def check_parts(self) -> None:
         """Refuse iterations of an update that has no derivative."""

@@ -14,7 +14,7 @@ from ..updates import particles
 from ..validation import Array, Rng, all_finite
 from .base import SensorFilter
 from .options import FusesBeliefs, IsolatesRuns, ScoresObservations, SharesObservations
-from .particle import compute_moments
+from .particle import compute_moments, select_visible
 from .priors import Prior, prior_mixtures
 from .record import Summary
 from .states import SensorState, State
@@ -247,7 +247,7 @@ class GridFilter(
         weights = np.exp(old)
         group = step.gate(
             group,
-            _predicted_moments,
+            _predict_moments,
             predicted,
             weights,
             is_torn=True,
@@ -283,13 +283,9 @@ def _normalize_joint(joint: Array, *_: object) -> tuple[Array, Array]:
     return np.maximum(joint - total, _LEAST), total[..., 0]
 
 
-def _predicted_moments(predicted: Array, weights: Array) -> tuple[Array, Array]:
+def _predict_moments(predicted: Array, weights: Array) -> tuple[Array, Array]:
     """Return moments of the predictions of the cells that can see; NaN if none can."""
-    sees = np.asarray(~np.isnan(predicted).any(axis=-1))
-    weights = np.where(sees, weights, 0.0)
-    total = weights.sum(axis=-1, keepdims=True)
-    weights = weights / np.where(total > 0, total, np.nan)
-    return compute_moments(np.where(sees[..., None], predicted, 0.0), weights)
+    return compute_moments(*select_visible(predicted, weights))
 
 
 @lru_cache(maxsize=8)

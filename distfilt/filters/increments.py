@@ -254,6 +254,8 @@ class InformationIncrementFilter(TargetMixtureFilter):
         self, observations: Sequence[Observation]
     ) -> tuple[list[Observation], list[Observation]]:
         """Split observations into the agent's own components and the shared ones."""
+        if not self.shared_components:
+            return list(observations), []
         private: list[Observation] = []
         shared: list[Observation] = []
         for observation in observations:
@@ -298,8 +300,8 @@ def _choose_branch(
 
 def _unpack(numbers: Array, n: int) -> Array:
     """Return the increment of n components, whose number of rows follows from its length."""
-    # r rows of an upper trapezoid with n + 1 columns.
-    sizes = [np.triu_indices(r, 0, n + 1)[0].size for r in range(1, n + 1)]
+    # r rows of an upper trapezoid with n + 1 columns: n + 1, n, … numbers
+    sizes = [r * (n + 1) - r * (r - 1) // 2 for r in range(1, n + 1)]
     n_rows = sizes.index(numbers.size) + 1
     increment = np.zeros((n_rows, n + 1))
     increment[np.triu_indices(n_rows, 0, n + 1)] = numbers

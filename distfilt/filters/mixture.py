@@ -253,8 +253,8 @@ class TargetMixtureFilter(
                         second, *likelihood, residual=residual, on_branch=True
                     )
             # The gate puts NaN in place of a rejected observation.
-            if step.rejected is not None:
-                step.rejected[agent] += np.isnan(value).all()
+            is_rejected = bool(np.isnan(value).all())
+            step.note_gated(agent, observation, is_rejected=is_rejected)
         return belief, second
 
 

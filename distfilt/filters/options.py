@@ -19,7 +19,7 @@ from ..validation import (
 from .base import Filter
 from .observations import Observation
 from .plans import TimesArgument
-from .record import SCORES, Score, Truth
+from .record import SCORES, Recording, Score, Scored, Truth
 from .states import State
 
 if TYPE_CHECKING:
@@ -133,7 +133,8 @@ class ScoresObservations(Filter[S]):
         ``log_likelihood``, the logarithm of their density given all earlier observations; ``nis``,
         their normalised innovation squared, added up; and ``n_observed``, how many numbers they
         are. The sum of ``log_likelihood`` over a run is the evidence of the model, and for a
-        consistent filter ``nis`` is ``n_observed`` on average.
+        consistent filter ``nis`` is ``n_observed`` on average. In a step with an observation of a
+        likelihood sensor without moments ``nis`` is NaN, since it is unknown.
 
     Examples
     --------
@@ -181,6 +182,8 @@ class KeepsPast(Filter[S]):
         *,
         truth: Truth = None,
         scores: Collection[Score] = SCORES,
+        scored: Scored = None,
+        keep: Collection[str] | None = None,
         delayed: Sequence[Observation] = (),
     ) -> xarray.Dataset:
         """Fixed-lag smoothing: record of each time the belief when `lag` more have been observed.
@@ -190,6 +193,5 @@ class KeepsPast(Filter[S]):
         """
         if not self.lag:
             raise ValueError("lag must be at least 1 for smoothing, got 0")
-        return self._record(
-            state, times, observations, truth, scores, delayed, self.lag
-        )
+        recording = Recording(truth, scores, scored, keep)
+        return self._record(state, times, observations, recording, delayed, self.lag)

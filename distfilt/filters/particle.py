@@ -123,11 +123,11 @@ class ParticleFamily(MembersFilter[ParticleState]):
         origin = stack[-1]
         if step.dt:
             if self.periods:
-                check_transition(self.model, origin.mean(axis=-2), state.t, step.dt)
-            moved = self.model.sample_step(origin, state.t, step.dt, rng=step.rng)
+                check_transition(step.model, origin.mean(axis=-2), state.t, step.dt)
+            moved = step.model.sample_step(origin, state.t, step.dt, rng=step.rng)
             stack[-1] = step.check_forecast(moved, origin)
             if self.notices_wrapping:
-                warn_of_wrapping(self.model, origin, moved, state.t, step.dt)
+                warn_of_wrapping(step.model, origin, moved, state.t, step.dt)
         self._assimilate(log_weights, stack, origin, step)
         if self.periods:
             # Moments and fusion need one branch: that about the weighted particles' direction.
@@ -495,6 +495,8 @@ class ParticleFilter(
     array([[1.9]])
     """
 
+    supports_agent_models: ClassVar[bool] = True
+
 
 _TINY = np.finfo(float).tiny
 _FEWEST = 10.0
@@ -569,13 +571,21 @@ def measure_families(
 def _moments_by_logs(predicted: Array, log_weights: Array) -> tuple[Array, Array]:
     weights = np.exp(log_weights)
     if not all_finite(predicted):
-        # Of the particles that can see; NaN if there are none.
-        sees = np.asarray(~np.isnan(predicted).any(axis=-1))
-        weights = np.where(sees, weights, 0.0)
-        total = weights.sum(axis=-1, keepdims=True)
-        weights = weights / np.where(total > 0, total, np.nan)
-        predicted = np.where(sees[..., None], predicted, 0.0)
+        predicted, weights = select_visible(predicted, weights)
     return compute_moments(predicted, weights)
+
+
+def select_visible(predicted: Array, weights: Array) -> tuple[Array, Array]:
+    """Return predictions (..., N, m) and weights (..., N) of the points that can see.
+
+    The others' predictions and weights are zero, and the weights are normalised again: NaN if
+    no point can see.
+    """
+    is_visible = np.asarray(~np.isnan(predicted).any(axis=-1))
+    weights = np.where(is_visible, weights, 0.0)
+    total = weights.sum(axis=-1, keepdims=True)
+    weights = weights / np.where(total > 0, total, np.nan)
+    return np.where(is_visible[..., None], predicted, 0.0), weights
 
 
 def compute_moments(points: Array, weights: Array) -> tuple[Array, Array]:

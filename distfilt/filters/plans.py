@@ -56,7 +56,8 @@ def plan_steps(
     # With events the grid may be empty: their own times are enough.
     grid = np.zeros(0) if times is None else check_array(times, "times", ("T",))
     check_increasing(grid, "times")
-    if are_observations(observations) and (times is None or observations):
+    # An empty list has no entry for any agent, so it can only be one without events.
+    if are_observations(observations):
         grid, entries = _plan_events(f, grid, observations)
     elif times is None:
         raise ValueError(

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import (
+    Callable,
+    Collection,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from dataclasses import dataclass, field
 from itertools import groupby, islice
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..ensembles import sample_covariance
 from ..linalg import cholesky, quadratic_form, to_unit_variances
 from ..metrics import crps, gaussian_crps
 from ..network import Ledger
 from ..periods import align, warn_of_wrapped_truth
-from ..validation import Array, check_array
+from ..validation import Array, InvalidArgumentError, call_user, check_array
 from .states import AnyState, SensorState, State, stack_states
 
 if TYPE_CHECKING:
@@ -24,12 +31,26 @@ if TYPE_CHECKING:
 
     from .base import Filter
 
-    Truth = ArrayLike | Mapping[str, ArrayLike] | None
+    TruthOfTime = Callable[[float], ArrayLike]
+    TruthSeries = ArrayLike | TruthOfTime
+    Truth = TruthSeries | Mapping[str, TruthSeries] | None
+    Scored = Sequence[str] | Sequence[Sequence[str]] | None
 else:
     # Checked by `_read_truth`, which converts it; a table of pandas serves as a mapping.
     Truth = object
+    # Checked by `_read_scored`.
+    Scored = object
 
-__all__ = ["SCORES", "Score", "Summary", "Truth", "final_state", "record_run"]
+__all__ = [
+    "SCORES",
+    "Recording",
+    "Score",
+    "Scored",
+    "Summary",
+    "Truth",
+    "final_state",
+    "record_run",
+]
 
 Score = Literal["squared_error", "nees", "crps"]
 SCORES: tuple[Score, ...] = ("squared_error", "nees", "crps")
@@ -63,7 +84,8 @@ _MEANING = {
     ),
     "crps": ("continuous ranked probability score", "of the component"),
     "nees": (
-        "normalised estimation error squared; its mean is d for a consistent filter",
+        "normalised estimation error squared of the components scored together; its mean is "
+        "their number for a consistent filter",
         "1",
     ),
     "unseen": (
@@ -131,15 +153,27 @@ class Summary:
     numbers: Mapping[str, Array] = field(default_factory=dict)
 
 
-Components = list[int] | slice
+Components = NDArray[np.intp] | slice
+"""Index of components: of all agents, (k,), of each, (A, k), or a slice of all."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What a run records beside its estimates; the options of :meth:`Filter.run`."""
+
+    truth: Truth = None
+    scores: Collection[Score] = SCORES
+    scored: Scored = None
+    keep: Collection[str] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class _KnownTruth:
-    """The truth, (T, *runs, 1 or A, d), and the index of the components that are known."""
+    """The truth, (T, *runs, 1 or A, d), and the index of the components scored together."""
 
     values: Array
     components: Components
+    scores: Collection[Score]
 
 
 def record_run(
@@ -147,8 +181,7 @@ def record_run(
     times: Array,
     start: AnyState,
     believed: Iterable[Believed[AnyState]],
-    truth: Truth,
-    scores: Collection[Score],
+    recording: Recording,
 ) -> xarray.Dataset:
     """Record the states of a run in one Dataset.
 
@@ -161,8 +194,7 @@ def record_run(
         The state before the run.
     believed : iterable of (state, state)
         The state at each time, and the belief about that time.
-    truth, scores
-        As for :meth:`distfilt.filters.Filter.run`.
+    recording : Recording
     """
     import xarray
 
@@ -170,8 +202,9 @@ def record_run(
     agents = list(f.agents)
     runs = start.runs
     # The truth is checked before the first step.
-    known_truth = _read_truth(truth, names, (times.size, *runs), len(agents))
-    series, ledgers, last = _collect_series(f, start, believed, known_truth, scores)
+    known_truth = _read_truth(recording, names, (times.size, *runs), len(agents), times)
+    keep = _read_keep(recording.keep, f, start, known_truth)
+    series, counts, last = _collect_series(f, start, believed, known_truth, keep)
 
     # Axes: time first, then the runs, then the agents.
     run_axes = ["run"] if len(runs) == 1 else [f"run{i}" for i in range(len(runs))]
@@ -185,7 +218,9 @@ def record_run(
         attributes = {"long_name": meaning, "units": unit}
         variables[name] = axes.get(name, lead), values, attributes
     for name in _LEDGER_FIELDS:
-        variables |= _count_messages(name, ledgers)
+        variables |= _count_messages(name, counts[name])
+    if keep is not None:
+        variables = {name: variables[name] for name in variables if name in keep}
     coords = {
         "time": ("time", times, {"units": "s"}),
         "agent": agents,
@@ -205,17 +240,21 @@ def _collect_series(
     start: AnyState,
     believed: Iterable[Believed[AnyState]],
     known: _KnownTruth | None,
-    scores: Collection[Score],
-) -> tuple[dict[str, Array], list[Ledger], State]:
-    """Return the recorded arrays, (T, ...) each, the ledgers, and the last state."""
+    keep: Collection[str] | None,
+) -> tuple[dict[str, Array], dict[str, Array], State]:
+    """Return the recorded arrays, (T, ...) each, the ledgers' counts, and the last state.
+
+    The counts, (T + 1, ...) each, begin with those of the state before the run. Only variables to
+    `keep` are collected, and the variance, which the spread needs.
+    """
     rows: list[dict[str, Array]] = []
-    ledgers = [start.ledger]
+    counts = [_read_ledgers([start.ledger])]
+    first = 0
     last = start
     for block in _blocks(believed, f.batched_summary):
-        first = len(ledgers) - 1
         # The ledgers are those of the states, the estimates those of the (smoothed) beliefs.
         states = [state for state, _ in block]
-        ledgers += [state.ledger for state in states]
+        counts.append(_read_ledgers([state.ledger for state in states]))
         last = states[-1]
         is_single = len(block) == 1
         beliefs = [belief for _, belief in block]
@@ -231,17 +270,16 @@ def _collect_series(
             row["unseen"] = unseen[0] if is_single else unseen
         if known is not None:
             index = first if is_single else slice(first, first + len(block))
-            values = known.values[index]
-            if f.periods:
-                # A truth that wraps and one that runs on are the same.
-                values = np.broadcast_to(values, summary.mean.shape)
-                values = align(values, summary.mean, f.periods)
-            row |= _score(summary, values, known.components, scores)
+            row |= _score_block(f, summary, known, index)
+        if keep is not None:
+            row = {name: row[name] for name in row if name in (*keep, "variance")}
         if is_single:
             row = {name: value[None] for name, value in row.items()}
         rows.append(row)
+        first += len(block)
+    totals = {name: np.concatenate([c[name] for c in counts]) for name in counts[0]}
     if not rows:
-        return _read_nothing(f, start, known, scores), ledgers, last
+        return _read_nothing(f, start, known), totals, last
     series = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
     if known is not None:
         warn_of_wrapped_truth(f, series["mean"], known.values)
@@ -250,7 +288,33 @@ def _collect_series(
     spread = np.sqrt(np.nansum(variance, axis=-1))
     is_missing = np.isnan(variance).all(axis=-1)
     series["spread"] = np.where(is_missing, np.nan, spread)
-    return series, ledgers, last
+    return series, totals, last
+
+
+def _read_ledgers(ledgers: list[Ledger]) -> dict[str, Array]:
+    """Return the counts of ledgers, one after the other, by field."""
+    # Where nobody sends, the ledger stays the same object.
+    repeats = 1
+    if len(ledgers) > 1 and all(ledger is ledgers[0] for ledger in ledgers):
+        repeats = len(ledgers)
+        ledgers = ledgers[:1]
+    counts = {}
+    for name in _LEDGER_FIELDS:
+        column = np.array([getattr(ledger, name) for ledger in ledgers])
+        counts[name] = np.repeat(column, repeats, axis=0)
+    return counts
+
+
+def _score_block(
+    f: Filter[AnyState], summary: Summary, known: _KnownTruth, index: int | slice
+) -> dict[str, Array]:
+    """Return the scores of a summary of the times with this index."""
+    values = known.values[index]
+    if f.periods:
+        # A truth that wraps and one that runs on are the same.
+        values = np.broadcast_to(values, summary.mean.shape)
+        values = align(values, summary.mean, f.periods)
+    return _score(summary, values, known)
 
 
 def _read_unseen(states: Sequence[SensorState], n_agents: int) -> Array:
@@ -269,7 +333,6 @@ def _read_nothing(
     f: Filter[AnyState],
     start: AnyState,
     known: _KnownTruth | None,
-    scores: Collection[Score],
 ) -> dict[str, Array]:
     """Return the arrays of a record without a single time, (0, ...) each."""
     summary = f.summarize(start)
@@ -284,7 +347,7 @@ def _read_nothing(
         for name in _STEP_FIELDS[1:]:
             row[name] = np.zeros(lead)
     if known is not None:
-        row |= _score(summary, 0 * summary.mean, known.components, scores)
+        row |= _score(summary, 0 * summary.mean, known)
     return {name: np.asarray(value)[None][:0] for name, value in row.items()}
 
 
@@ -314,27 +377,71 @@ def _blocks(
             block = list(islice(same_shape, size))  # noqa: B031
 
 
+def _read_keep(
+    keep: Collection[str] | None,
+    f: Filter[AnyState],
+    start: AnyState,
+    known: _KnownTruth | None,
+) -> Collection[str] | None:
+    """Check the names of the variables to keep, and return them with that of the mean."""
+    if keep is None:
+        return None
+    ledger = [(name, f"{name}_total") for name in _LEDGER_FIELDS]
+    recorded = {*_read_nothing(f, start, known), *sum(ledger, ())}
+    unknown = [name for name in keep if name not in recorded]
+    if unknown:
+        raise ValueError(
+            f"keep must have names among {', '.join(sorted(recorded))}, got {unknown}"
+        )
+    # Without the mean a record has no final state.
+    return {"mean", *keep}
+
+
 def _read_truth(
-    truth: Any, names: Sequence[str], shape: tuple[int, ...], n_agents: int
+    recording: Recording,
+    names: Sequence[str],
+    shape: tuple[int, ...],
+    n_agents: int,
+    times: Array,
 ) -> _KnownTruth | None:
     """Check the truth, whose shape is (T, *runs) for each component."""
+    truth: Any = recording.truth
     if truth is None:
+        if recording.scored is not None:
+            raise ValueError("scored must be None without a truth, got components")
         return None
     # A table whose columns are components says itself which is which.
     columns = getattr(truth, "columns", None)
     if columns is not None and set(columns) <= set(names):
         truth = {name: truth[name] for name in columns}
     if isinstance(truth, Mapping):
-        return _read_components(truth, names, shape, n_agents)
-    values = check_array(truth, "truth", None, finite=False)
-    if values.shape == (*shape, len(names)):
-        return _KnownTruth(values[..., None, :], slice(None))
-    if values.shape != (*shape, n_agents, len(names)):
-        raise ValueError(
-            f"truth must be shape {(*shape, len(names))}, one for each of {n_agents} "
-            f"agents, or a dict of those components that are known, got {values.shape}"
-        )
-    return _KnownTruth(values, slice(None))
+        values, components = _read_components(truth, names, shape, n_agents, times)
+    else:
+        values = _read_series(truth, "truth", times)
+        components = slice(None)
+        if values.shape == (*shape, len(names)):
+            values = values[..., None, :]
+        elif values.shape != (*shape, n_agents, len(names)):
+            raise ValueError(
+                f"truth must be shape {(*shape, len(names))}, one for each of {n_agents} "
+                f"agents, or a dict of those components that are known, got {values.shape}"
+            )
+    if recording.scored is not None:
+        components = _read_scored(recording.scored, names, n_agents)
+    return _KnownTruth(values, components, recording.scores)
+
+
+def _read_series(entry: Any, name: str, times: Array) -> Array:
+    """Return a series, or the values of a function at the times; NaN where nothing is known."""
+    if callable(entry):
+        values = [np.asarray(call_user(entry, t)) for t in times.tolist()]
+        shapes = {value.shape for value in values}
+        if len(shapes) > 1:
+            raise ValueError(
+                f"{name} must return one shape at all times, got {sorted(shapes)}"
+            )
+        entry = np.stack(values) if values else np.zeros(0)
+    return check_array(entry, name, None, finite=False)
 
 
 def _read_components(
@@ -342,7 +449,8 @@ def _read_components(
     names: Sequence[str],
     shape: tuple[int, ...],
     n_agents: int,
-) -> _KnownTruth:
+    times: Array,
+) -> tuple[Array, Components]:
     """Check a truth of some components, by their names; the others are NaN."""
     unknown = [name for name in truth if name not in names]
     if unknown or not truth:
@@ -352,48 +460,83 @@ def _read_components(
     # NaN where nothing is known, so that no score is computed there.
     values = np.full((*shape, n_agents, len(names)), np.nan)
     for name, entry in truth.items():
-        series = check_array(entry, f"truth[{name!r}]", None)
+        series = _read_series(entry, f"truth[{name!r}]", times)
         if series.shape == shape:
             series = series[..., None]
         else:
-            series = check_array(series, "truth", (*shape, n_agents))
+            series = check_array(series, "truth", (*shape, n_agents), finite=False)
         values[..., names.index(name)] = series
-    return _KnownTruth(values, [names.index(name) for name in truth])
+    return values, np.array([names.index(name) for name in truth], dtype=np.intp)
 
 
-def _score(
-    summary: Summary, truth: Array, components: Components, scores: Collection[Score]
-) -> dict[str, Array]:
-    """Return the scores of a summary in the components whose truth is given, by their index.
+def _read_scored(scored: Any, names: Sequence[str], n_agents: int) -> Components:
+    """Return the index of the components that are scored together, (k,) or (A, k)."""
+    if isinstance(scored, str):
+        raise InvalidArgumentError(
+            f"scored must be a sequence of names of components, got {scored!r}"
+        )
+    rows = list(scored)
+    is_common = all(isinstance(name, str) for name in rows)
+    if is_common:
+        rows = [rows]
+    elif len(rows) != n_agents:
+        raise ValueError(
+            f"scored must have one list for each of {n_agents} agents, got {len(rows)}"
+        )
+    sizes = {len(row) for row in rows}
+    if len(sizes) != 1 or 0 in sizes:
+        raise ValueError(
+            f"scored must name as many components, one or more, for each agent, got "
+            f"{sorted(sizes)}"
+        )
+    unknown = [name for row in rows for name in row if name not in names]
+    if unknown or any(len(set(row)) < len(row) for row in rows):
+        raise ValueError(
+            f"scored must have different names among {', '.join(names)}, got {rows}"
+        )
+    index = np.array([[names.index(name) for name in row] for row in rows])
+    return index[0] if is_common else index
 
-    A belief is scored if its mean and the truth are finite in all of them; otherwise crps and nees
-    are NaN.
+
+def _select(values: Array, components: Components, *, behind: int = 0) -> Array:
+    """Return the components (..., A, [N,] k) of values (..., A, [N,] d).
+
+    `behind` is the number of axes between the agents and the components.
+    """
+    if isinstance(components, slice) or components.ndim == 1:
+        return values[..., components]
+    n_agents, size = components.shape
+    index = components.reshape(n_agents, *[1] * behind, size)
+    lead = (1,) * (values.ndim - index.ndim)
+    return np.take_along_axis(values, index.reshape(*lead, *index.shape), axis=-1)
+
+
+def _score(summary: Summary, truth: Array, known: _KnownTruth) -> dict[str, Array]:
+    """Return the scores of a summary.
+
+    Components are scored one by one where their truth is given. Those that are scored together
+    have a nees and a total where their estimates and their truth are all finite, NaN elsewhere.
     """
     result: dict[str, Array] = {}
+    scores = known.scores
     mean = summary.mean
     truth = np.broadcast_to(truth, mean.shape)
-    known_mean = mean[..., components]
-    known_truth = truth[..., components]
-    is_finite = np.isfinite(known_mean) & np.isfinite(known_truth)
-    is_scored = np.asarray(is_finite.all(axis=-1))
+    together = _select(mean - truth, known.components)
+    is_scored = np.asarray(np.isfinite(together).all(axis=-1))
     if "squared_error" in scores:
-        # Component by component, NaN without a truth; the total leaves those out.
-        squared = (mean - truth) ** 2
-        result["squared_error"] = squared
-        result["total_squared_error"] = squared[..., components].sum(axis=-1)
+        result["squared_error"] = (mean - truth) ** 2
+        result["total_squared_error"] = (together**2).sum(axis=-1)
     if "crps" in scores:
         # In closed form for a Gaussian, from the sorted members for an ensemble.
         if summary.members is None:
             value = gaussian_crps(mean, np.sqrt(summary.variance), truth)
         else:
             value = crps(summary.members, truth, weights=summary.weights)
-        is_known = is_scored[..., None] & ~np.isnan(truth)
-        result["crps"] = np.where(is_known, value, np.nan)
-    cov = _known_covariance(summary, components) if "nees" in scores else None
+        result["crps"] = np.where(np.isfinite(mean - truth), value, np.nan)
+    cov = _known_covariance(summary, known.components) if "nees" in scores else None
     if cov is not None:
         nees = np.full(is_scored.shape, np.nan)
-        error = known_mean[is_scored] - known_truth[is_scored]
-        nees[is_scored] = _nees(error, cov[is_scored])
+        nees[is_scored] = _nees(together[is_scored], cov[is_scored])
         result["nees"] = nees
     return result
 
@@ -401,10 +544,11 @@ def _score(
 def _known_covariance(summary: Summary, components: Components) -> Array | None:
     """Return the covariance of the known components; None if the summary has none."""
     if summary.covariance is not None:
-        return summary.covariance[..., components, :][..., components]
+        rows = _select(summary.covariance, components, behind=1)
+        return _select(rows.mT, components, behind=1)
     if summary.members is None:
         return None
-    members = summary.members[..., components]
+    members = _select(summary.members, components, behind=1)
     if members.shape[-2] <= members.shape[-1]:
         # A sample covariance of so few members is singular.
         return None
@@ -461,10 +605,8 @@ def final_state(run: xarray.Dataset) -> State:
     )
 
 
-def _count_messages(name: str, ledgers: list[Ledger]) -> dict[str, object]:
+def _count_messages(name: str, total: Array) -> dict[str, object]:
     """Return one field of the ledgers as variables: in each step, and up to then."""
-    # The first ledger is that of the state before the run.
-    total = np.array([getattr(ledger, name) for ledger in ledgers])
     axes = ("time", "agent")[: total.ndim]
     unit = "B" if name.endswith("bytes") else "1"
     in_step = {"long_name": f"{name} in this step", "units": unit}

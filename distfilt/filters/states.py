@@ -59,6 +59,10 @@ class State(FrozenModel):
         that a state can be stepped twice.
     rejected : ndarray, (*runs, A), optional
         How many observations each agent's gate rejected in the last step; None without a gate.
+    rejection_streaks : ndarray, (*runs, A, B, S + 1), optional
+        How many observations in a row it has rejected, of each of B sources: of each of the
+        source's sensors, and of those that came with their observations. Without shared
+        observations an agent is its only source, B = 1.
     log_likelihood, nis, n_observed : ndarray, (*runs, A), optional
         Scores of the observations of the last step, see
         :class:`~distfilt.filters.ScoresObservations`; None if they are not recorded.
@@ -77,6 +81,9 @@ class State(FrozenModel):
     ledger: Ledger
     rng: np.random.Generator | None
     rejected: Annotated[Array, "..."] | None = field(default=None, kw_only=True)
+    rejection_streaks: Annotated[Array, "..."] | None = field(
+        default=None, kw_only=True
+    )
     log_likelihood: Annotated[Array, "...", ALLOW_NAN] | None = field(
         default=None, kw_only=True
     )
@@ -273,6 +280,6 @@ def stack_states(states: Sequence[AnyState]) -> AnyState:
     # Everything else, such as the time, is taken from the first state.
     arrays = {}
     for name, value in vars(first).items():
-        if type(value) is np.ndarray and name != "unseen":
+        if type(value) is np.ndarray and name not in ("unseen", "rejection_streaks"):
             arrays[name] = np.array([getattr(state, name) for state in states])
     return first.replace(**arrays)

@@ -11,7 +11,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from types import EllipsisType
 from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, cast
 
@@ -30,7 +30,8 @@ from . import failures
 from .changes import Previous, References
 from .exchange import Known, collect_observations, fuse_beliefs
 from .failures import RECOVERABLE, FilterError, Row
-from .observations import Observation
+from .gating import RejectionStreaks
+from .observations import Observation, sensor_of
 from .repetition import Assimilated
 from .states import SensorState, State
 
@@ -44,6 +45,8 @@ S = TypeVar("S", bound=State)
 _NO_RUNS = np.zeros((), dtype=bool)
 _NOTHING = np.zeros((0, 0))
 _LOG_2PI = math.log(2 * math.pi)
+_FEW = 64
+"""Up to how many agents many plans of their observations are kept."""
 
 
 class Step(Generic[S]):
@@ -159,13 +162,20 @@ class Step(Generic[S]):
             self.times = tuple(sorted(times))
         # Counted only with a gate.
         self.rejected: Array | None = None
+        self.streaks: RejectionStreaks | None = None
         if filter_.gate_probability is not None:
             self.rejected = np.zeros((*self.runs, filter_.n_agents))
+            self.streaks = RejectionStreaks(self.filter, state, self.runs)
         # Added up over the observations, if they are recorded.
         self.scores: dict[str, Array] = {}
         if filter_.record_evidence:
             for name in ("log_likelihood", "nis", "n_observed"):
                 self.scores[name] = np.zeros((*self.runs, filter_.n_agents))
+
+    @cached_property
+    def model(self) -> Model:
+        """The model of the agents' states, (*runs, A, ..., d)."""
+        return self.filter.model_of_states(self.runs)
 
     # The beliefs -----------------------------------------------------------------------
 
@@ -228,6 +238,8 @@ class Step(Generic[S]):
                     group = group.with_target(self.keep_failed(group.target, np.nan))
                 if self.filter.periods:
                     group.circular_model = self.filter.model
+                if self.streaks is not None:
+                    group.streaks = self.streaks.list_numbers(t, group.agents)
                 yield place, group
 
     def _known_observations(self) -> Known:
@@ -243,6 +255,8 @@ class Step(Generic[S]):
             for o in observations:
                 if self.references is not None:
                     self.references.receive(agent, o)
+                if self.streaks is not None:
+                    self.streaks.note(self.t, agent, o)
                 sensor = o.sensor
                 if isinstance(sensor, int):
                     sensor = f.agent_sensors[o.agent][sensor]
@@ -309,11 +323,30 @@ class Step(Generic[S]):
         if self.rejected is not None:
             # A filter with a gate has a probability.
             probability = cast(float, self.filter.gate_probability)
+            before = group
             group, rejected = group.gate(mean, cov, probability)
             self.rejected[..., group.agents] += rejected
+            streaks = cast(RejectionStreaks, self.streaks)
+            warning = streaks.count_group(before, group, mean)
+            if warning is not None:
+                self.warn_once("gate", warning)
         if self.scores:
             self._score(group, mean, cov, is_gaussian)
         return group
+
+    def note_gated(
+        self, agent: int, observation: Observation, *, is_rejected: bool
+    ) -> None:
+        """Count an observation that an agent's gate has tested by itself, in a single run."""
+        if self.rejected is None:
+            return
+        self.rejected[agent] += is_rejected
+        streaks = cast(RejectionStreaks, self.streaks)
+        number = streaks.number_of(agent, observation)
+        rejected = np.array([is_rejected])
+        if streaks.count(np.array([number]), rejected, ~rejected).any():
+            sensor = sensor_of(self.filter, observation)
+            self.warn_once("gate", streaks.describe(number, sensor.kind))
 
     def _score(
         self, group: Received, mean: Array, cov: Array, is_gaussian: bool
@@ -322,6 +355,8 @@ class Step(Generic[S]):
         innovation = group.target - mean
         missing = np.isnan(innovation)
         n_observed = (~missing).sum(axis=-1)
+        # These count, but their innovations are unknown, and so is the sum that they belong to.
+        n_unpredicted = group.count_unpredicted()
         # Missing numbers have a zero innovation and a unit covariance.
         is_pair = ~missing[..., :, None] & ~missing[..., None, :]
         unit = np.eye(innovation.shape[-1])
@@ -337,8 +372,9 @@ class Step(Generic[S]):
         nis, log_volume = self.apply(
             compute, (innovation, innovation_cov), (zero, zero), group.agents
         )
-        self.scores["nis"][..., group.agents] += nis
-        self.scores["n_observed"][..., group.agents] += n_observed
+        nis_or_nan = np.where(n_unpredicted > 0, np.nan, nis)
+        self.scores["nis"][..., group.agents] += nis_or_nan
+        self.scores["n_observed"][..., group.agents] += n_observed + n_unpredicted
         if is_gaussian:
             # log N(r; 0, S)
             log_density = -0.5 * (nis + log_volume + n_observed * _LOG_2PI)
@@ -493,6 +529,8 @@ class Step(Generic[S]):
         if self.has_sensors:
             belief["assimilated"] = self._note_assimilated()
             belief["warned"] = self.warned
+        if self.streaks is not None:
+            belief["rejection_streaks"] = self.streaks.counts
         # The messages in the step are in the channel's ledger.
         ledger = state.ledger if self.channel is None else self.channel.ledger
         # A failed run has no score.
@@ -589,7 +627,7 @@ class Received:
     agents : ndarray of int, (G,)
         Their numbers.
     rows : slice or ndarray
-        The same as an index of an array of all agents; a slice if the group is all of them.
+        The same as an index of an array of all agents; a slice if none is left out between two.
     target : ndarray, (*runs, G, M)
         The observed values, NaN where a component is missing.
     noise : ndarray, (M, M) or (G, M, M)
@@ -620,8 +658,9 @@ class Received:
     ) -> None:
         self.agents = np.array(agents, dtype=np.intp)
         # A slice gives views, where a list of numbers copies.
-        is_everybody = agents == list(range(len(sensors)))
-        self.rows: Indices | slice = slice(None) if is_everybody else self.agents
+        self.rows: Indices | slice = self.agents
+        if agents == list(range(agents[0], agents[-1] + 1)):
+            self.rows = slice(agents[0], agents[-1] + 1)
         size = sum(sensor.dim for sensor in sensors[agents[0]])
         # Which of its agent's sensors each number belongs to, for the gate.
         self.sensor_index = np.zeros((len(agents), size), dtype=np.intp)
@@ -638,12 +677,15 @@ class Received:
         self.linear = all(sensor.linear is not None for sensor in starts)
         self.changes = any(sensor.uses_previous for sensor in starts)
         self.wraps = any(sensor.wraps for sensor in starts)
+        self.half_periods = self._collect_half_periods()
         # The sensors that are likelihoods: their numbers are not predicted.
         self.likelihoods = [
             part for part in self.parts if isinstance(part.sensor, LikelihoodSensor)
         ]
         # The model, if it has circular components.
         self.circular_model: Model | None = None
+        # Which streak of rejections each observation of each agent belongs to, with a gate.
+        self.streaks: list[list[int]] = []
         # All agents have the same only sensor: nothing has to be sorted.
         self.has_one_part = isinstance(self.parts[0].agents, slice)
         self._matrices: dict[int, Array] = {}
@@ -669,6 +711,21 @@ class Received:
                 block = slice(start, start + sensor.dim)
                 noise[g, block, block] = sensor.noise_cov
         return noise[0] if (noise == noise[:1]).all() else noise
+
+    def _collect_half_periods(self) -> Array | None:
+        """Return half the period of each number, (G, M), infinity without one.
+
+        None if no number wraps, or one wraps by a sensor's own function.
+        """
+        if not self.wraps:
+            return None
+        result = np.full(self.sensor_index.shape, np.inf)
+        for part in self.parts:
+            if part.sensor.half_periods is not None:
+                result[part.cells] = part.sensor.half_periods
+            elif part.sensor.wraps:
+                return None
+        return result
 
     @property
     def has_same_sensors(self) -> bool:
@@ -749,8 +806,8 @@ class Received:
 
         These are sums over the members `states` (*runs, G, N, d) with `weights` (*runs, G, N), in
         the sensors' places of `mean` (*runs, G, M) and `cov` (*runs, G, M, M). A sensor without
-        moments is an error if they are required, as for a gate; otherwise its mean is NaN, so that
-        its observations count as missing.
+        moments is an error if they are required, as for a gate; otherwise its mean is NaN, and
+        :meth:`count_unpredicted` counts its observations.
         """
         mean = mean.copy()
         cov = cov.copy()
@@ -768,6 +825,24 @@ class Received:
             mean[(..., *part.cells)] = centre
             cov[_block_of(part)] = np.einsum("...n,...nij->...ij", w, covs)
         return mean, cov
+
+    def count_unpredicted(self) -> Array:
+        """Return how many numbers agents have of sensors without moments, (*runs, G)."""
+        count = np.zeros(self.target.shape[:-1])
+        for part in self.likelihoods:
+            if cast(LikelihoodSensor, part.sensor).moments is None:
+                observed = ~np.isnan(self.target[(..., *part.cells)])
+                self._add_by_agent(count, part, observed.sum(axis=-1))
+        return count
+
+    def _add_by_agent(
+        self, totals: Array, part: _Part, values: NDArray[np.generic]
+    ) -> None:
+        """Add values of each of a sensor's observations to those of its agents, in place."""
+        # Any: numpy's types of `at` have no index of several axes.
+        index: Any = (..., part.agents)
+        # An agent may have several observations of one sensor.
+        np.add.at(totals, index, values)
 
     def with_target(self, target: Array) -> Received:
         """Return the same group with these observed values."""
@@ -845,8 +920,13 @@ class Received:
         if branch == "each":
             return self.wrap_near(predicted, target)
         centre = predicted[..., :1, :]
-        if branch == "mean":
+        if branch == "mean" and predicted.shape[-2] > 1:
             centre = predicted.mean(axis=-2, keepdims=True)
+        if self.half_periods is not None:
+            # The usual case: all numbers are near as they are. NaN, a missing one, is not.
+            is_near = np.abs(target - centre) < self.half_periods[:, None, :]
+            if np.count_nonzero(is_near) == is_near.size:
+                return predicted
         shift = self.wrap_near(centre.copy(), target) - centre
         # Exactly zero where nothing turns; NaN where some state cannot be seen.
         if not np.count_nonzero(shift):
@@ -987,7 +1067,11 @@ def predict_points(sensor: Sensor, states: Array) -> Array:
 def _gather_predictions(
     sensor: Sensor, values: Array, states: Array, previous: Array | None
 ) -> Array:
-    """Bring a sensor's predictions (*runs, G, N, m) of states (*runs, G, N, d) onto one branch."""
+    """Bring a sensor's predictions (*runs, G, N, m) of states (*runs, G, N, d) onto one branch.
+
+    It lies about the prediction of the states' mean, since the observed value is not taken
+    farther than half a period from there.
+    """
     if values.shape[-2] == 1:
         return values
     half_periods = sensor.half_periods
@@ -1011,10 +1095,21 @@ def _gather_predictions(
         slope = sensor.jacobian(mean[..., 0, :])
         return np.asarray(fallback() + (states - mean) @ slope.mT)
 
-    return gather(values, sensor.bring_near, tangent, fallback, half_periods)
+    return gather(values, sensor.bring_near, tangent, fallback)
+
+
+@lru_cache(maxsize=1024)
+def _plan_few(pattern: tuple[tuple[Sensor, ...], ...]) -> list[Received]:
+    """Plan the groups of a few agents, of whose events many patterns recur."""
+    return _plan_groups(pattern)
 
 
 @lru_cache(maxsize=32)
+def _plan_many(pattern: tuple[tuple[Sensor, ...], ...]) -> list[Received]:
+    """Plan the groups of many agents, whose plans are large."""
+    return _plan_groups(pattern)
+
+
 def _plan_groups(pattern: tuple[tuple[Sensor, ...], ...]) -> list[Received]:
     """Plan a group for each number of values that occurs; agents without any are left out."""
     agents_by_size: dict[int, list[int]] = {}
@@ -1037,8 +1132,9 @@ def group_agents(
     """
     # The pattern of sensors is the key of the plan.
     pattern = tuple([tuple([s for s, _ in pairs]) for pairs in observations])
+    plans = _plan_few(pattern) if len(pattern) <= _FEW else _plan_many(pattern)
     groups = []
-    for plan in _plan_groups(pattern):
+    for plan in plans:
         values = [v for agent in plan.agents.tolist() for _, v in observations[agent]]
         # All agents' values side by side, then one row for each agent: (*runs, G, M).
         flat = values[0] if len(values) == 1 else np.concatenate(values, axis=-1)

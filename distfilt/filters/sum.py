@@ -16,6 +16,7 @@ from ..validation import Array, Rng
 from .base import SensorFilter
 from .gaussian import GaussianFamily, GaussianState
 from .options import SharesObservations
+from .particle import select_visible
 from .priors import Prior, prior_mixtures
 from .record import Summary
 from .resets import Reset
@@ -213,7 +214,7 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         covs: Array,
         log_weights: Array,
         group: Received,
-        step: Step[Any],
+        step: Step[GaussianSumState],
     ) -> None:
         """Condition and weight the components of a group's agents, in place."""
         rows = group.rows
@@ -228,7 +229,7 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         predicted_cov = slope @ cov @ slope.mT + extra
         group = step.gate(
             group,
-            _predicted_moments,
+            _predict_moments,
             predicted,
             np.exp(logs),
             predicted_cov,
@@ -319,12 +320,9 @@ def _mix(weights: Array, means: Array, covs: Array) -> tuple[Array, Array]:
     return mean, (weights[..., None, None] * covs).sum(axis=-3) + spread
 
 
-def _predicted_moments(
+def _predict_moments(
     predicted: Array, weights: Array, covs: Array
 ) -> tuple[Array, Array]:
     """Return moments of the predictions of the components that can see; NaN if none can."""
-    sees = np.asarray(~np.isnan(predicted).any(axis=-1))
-    weights = np.where(sees, weights, 0.0)
-    total = weights.sum(axis=-1, keepdims=True)
-    weights = weights / np.where(total > 0, total, np.nan)
-    return _mix(weights, np.where(sees[..., None], predicted, 0.0), covs)
+    predicted, weights = select_visible(predicted, weights)
+    return _mix(weights, predicted, covs)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar, cast
 
 import numpy as np
 
@@ -159,10 +159,13 @@ class ChannelFilter(GaussianFamily):
             step, means, covs, link_means=link_means, link_covariances=link_covs
         )
 
-    def _join_links(self, state: Any, *, only_links: bool = False) -> GaussianState:
+    def _join_links(
+        self, state: GaussianState, *, only_links: bool = False
+    ) -> GaussianState:
         """Return a state whose agents are followed by the links, or the links alone."""
-        means = state.link_means
-        covs = state.link_covariances
+        with_links = cast(ChannelFilterState, state)
+        means = with_links.link_means
+        covs = with_links.link_covariances
         if not only_links:
             means = np.concatenate([state.joint_means, means], axis=-2)
             covs = np.concatenate([state.joint_covariances, covs], axis=-3)

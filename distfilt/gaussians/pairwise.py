@@ -294,9 +294,7 @@ def unite_gaussians(
     >>> mean.round(6), cov.round(6)
     (array([2.]), array([[5.]]))
     """
-    leading = broadcast_leading(mean_a.shape[:-1], mean_b.shape[:-1], "mean_b")
-    leading = broadcast_leading(leading, cov_a.shape[:-2], "cov_a")
-    leading = broadcast_leading(leading, cov_b.shape[:-2], "cov_b")
+    leading = _broadcast_pair(mean_a, cov_a, mean_b, cov_b)
     difference = np.broadcast_to(mean_b - mean_a, (*leading, mean_a.shape[-1]))
     # (m_b - m_a)(m_b - m_a)ᵀ, of which the mean at ω takes ω² and (1 - ω)².
     square = difference[..., :, None] * difference[..., None, :]
@@ -321,16 +319,27 @@ def unite_gaussians(
     return mean_a + weight[..., None] * difference, symmetrise(factor @ factor.mT)
 
 
+def _broadcast_pair(
+    mean_a: Array, cov_a: Array, mean_b: Array, cov_b: Array
+) -> tuple[int, ...]:
+    """Return the leading axes to which two Gaussians broadcast."""
+    leading = broadcast_leading(mean_a.shape[:-1], mean_b.shape[:-1], "mean_b")
+    leading = broadcast_leading(leading, cov_a.shape[:-2], "cov_a")
+    return broadcast_leading(leading, cov_b.shape[:-2], "cov_b")
+
+
 def _diagonalise(
     mean_a: Array, cov_a: Array, mean_b: Array, cov_b: Array
 ) -> tuple[Array, Array, Array]:
-    """Return T, the diagonal of D, and T⁻¹ (m_b - m_a), of which the leading axes are equal."""
-    leading = broadcast_leading(mean_a.shape[:-1], mean_b.shape[:-1], "mean_b")
-    leading = broadcast_leading(leading, cov_a.shape[:-2], "cov_a")
-    leading = broadcast_leading(leading, cov_b.shape[:-2], "cov_b")
+    """Return T, the diagonal of D and z = T⁻¹ (m_b - m_a) of the coordinates common to both.
+
+    In them both covariances are diagonal: P_a = T Tᵀ and P_b = T D Tᵀ. The results have shapes
+    (..., d, d), (..., d) and (..., d) with the same leading axes.
+    """
+    leading = _broadcast_pair(mean_a, cov_a, mean_b, cov_b)
     size = cov_a.shape[-1]
     lower = np.broadcast_to(cholesky(cov_a), (*leading, size, size))
-    # L⁻¹ P_b L⁻ᵀ = V D Vᵀ
+    # P_a = L Lᵀ and L⁻¹ P_b L⁻ᵀ = V D Vᵀ, so that T = L V.
     half = solve_lower(lower, np.broadcast_to(cov_b, lower.shape))
     white = solve_lower(lower, np.ascontiguousarray(half.mT))
     d, axes = np.linalg.eigh(symmetrise(white))

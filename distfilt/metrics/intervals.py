@@ -64,16 +64,15 @@ def mean_interval(values: Values, *, level: Level = 0.95) -> Interval:
     >>> print(mean_interval([1.0, 2.0, 3.0, 4.0]))
     2.5 [0.446, 4.55]
     """
-    from scipy.special import stdtrit
+    from scipy import stats
 
     if values.size < 2:
         raise ValueError(f"values must have at least 2 values, got {values.size}")
     n = values.size
     mean = float(values.mean())
     error = float(values.std(ddof=1)) / float(np.sqrt(n))
-    # t quantile with n - 1 degrees of freedom
-    quantile = float(stdtrit(n - 1, 0.5 + level / 2))
-    half_width = quantile * error
+    # scipy's `ttest_1samp` gives the same, but warns of equal values.
+    half_width = float(stats.t.ppf(0.5 + level / 2, n - 1)) * error
     return Interval(mean, mean - half_width, mean + half_width, error)
 
 
@@ -97,19 +96,20 @@ def median_interval(values: Values, *, level: Level = 0.95) -> Interval:
     >>> print(median_interval([5.0, 1.0, 4.0, 2.0, 9.0, 3.0, 8.0]))
     4 [1, 9]
     """
-    from scipy.special import betainc, ndtri
+    from scipy import stats
 
     order_statistics = np.sort(values)
     n = values.size
     # P(B <= k - 1) for k = 1, 2, ...: the probability that the k-th smallest exceeds the median.
+    # scipy's `quantile_test` takes a smaller k where 2 P is exactly 1 - level.
     ranks = np.arange(1, (n + 1) // 2 + 1)
-    miss_probability = 2 * betainc(n - ranks + 1, ranks, 0.5)
+    miss_probability = 2 * stats.binom.cdf(ranks - 1, n, 0.5)
     k = int((miss_probability <= 1 - level).sum())
     if k == 0:
         raise ValueError(f"values must have more values for level {level:g}, got {n}")
     low = float(order_statistics[k - 1])
     high = float(order_statistics[n - k])
-    quantile = float(ndtri(0.5 + level / 2))
+    quantile = float(stats.norm.ppf(0.5 + level / 2))
     error = (high - low) / (2 * quantile)
     return Interval(float(np.median(values)), low, high, error)
 
@@ -143,24 +143,17 @@ def proportion_interval(
     >>> print(proportion_interval(0, 100))
     0 [0, 0.0362]
     """
-    from scipy.special import betaincinv
+    from scipy import stats
 
     k = successes
     n = trials
     if k > n:
         raise ValueError(f"successes must be at most trials, {n}, got {k}")
-    # Beta quantiles: P(B >= k) at the lower end, P(B <= k) at the upper end, are one tail each.
-    tail = (1 - level) / 2
-    low = 0.0
-    high = 1.0
-    if k > 0:
-        low = float(betaincinv(k, n - k + 1, tail))
-    if k < n:
-        high = float(betaincinv(k + 1, n - k, 1 - tail))
+    ends = stats.binomtest(k, n).proportion_ci(level, method="exact")
     proportion = k / n
     # The standard deviation of k / n at the estimated probability.
     error = float(np.sqrt(proportion * (1 - proportion) / n))
     # At a level near 0 the ends may pass each other; the estimate stays inside.
-    low = min(low, proportion)
-    high = max(high, proportion)
+    low = min(float(ends.low), proportion)
+    high = max(float(ends.high), proportion)
     return Interval(proportion, low, high, error)

@@ -88,6 +88,7 @@ def fuse_moments(
     """
     others = PartialFusion(prior, received, omega=omega).others
     gaussians = [other.moment_match() for other in others]
+    # Of Gaussians the fused density is one component, without approximation.
     exact = PartialFusion(prior.moment_match(), gaussians, omega=omega)
     return exact.component_shapes().with_equal_weights()
 

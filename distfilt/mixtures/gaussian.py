@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..linalg import log_det, log_sum_exp, symmetrise, to_unit_variances
+from ..linalg import (
+    log_det,
+    log_sum_exp,
+    symmetrise,
+    to_unit_variances,
+    upper_triangle,
+)
 from ..validation import (
     Array,
     ArrayInput,
@@ -268,7 +274,7 @@ class GaussianMixture(FrozenModel):
 
     def pack(self) -> tuple[Array, Array, Array]:
         """Return the payload of a channel: weights, means, and upper triangles (L, d(d+1)/2)."""
-        rows, columns = np.triu_indices(self.dim)
+        rows, columns = upper_triangle(self.dim)
         return self.weights, self.means, self.covs[:, rows, columns]
 
     @classmethod
@@ -293,7 +299,7 @@ class GaussianMixture(FrozenModel):
         """
         weights, means, triangles = payload
         dim = means.shape[1]
-        rows, columns = np.triu_indices(dim)
+        rows, columns = upper_triangle(dim)
         covs = np.empty((len(means), dim, dim))
         covs[:, rows, columns] = triangles
         covs[:, columns, rows] = triangles

@@ -1,6 +1,7 @@
 """Models of motion: the transition of a state from one time to the next, and its noise."""
 
 from . import orbit
+from .agents import AgentModels
 from .base import LinearModel, Model, simulate
 from .inputs import InputModel, Inputs
 from .motion import constant_velocity, lorenz63, rk4
@@ -17,6 +18,7 @@ from .satellite import clohessy_wiltshire, satellite_pose
 from .swarm import RotatingMixture, Swarm, rotating_swarm
 
 __all__ = [
+    "AgentModels",
     "InputModel",
     "Inputs",
     "LinearModel",

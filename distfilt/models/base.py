@@ -12,7 +12,12 @@ from typing import Annotated, ClassVar, cast
 
 import numpy as np
 
-from ..derivatives import difference_with_error, evaluate_derivative
+from ..derivatives import (
+    call_derivative,
+    difference_with_error,
+    evaluate_derivative,
+    needs_differences,
+)
 from ..linalg import factor
 from ..periods import Periods, PeriodsArgument, read_periods, wrap_differences
 from ..validation import (
@@ -127,8 +132,7 @@ class Model(FrozenModel):
     @validated
     def Q(self, t: float, dt: NonNegativeFloat) -> Array:
         """Covariance of the noise that a step from `t` to `t` + `dt` adds, (d, d), read-only."""
-        cov, _ = self._noise(t, dt)
-        return cov
+        return self._noise_cov(t, dt)
 
     @validated
     def noise_at(
@@ -143,15 +147,14 @@ class Model(FrozenModel):
     @validated
     def noise_sqrt(self, t: float, dt: NonNegativeFloat) -> Array:
         """Factor L of the noise covariance Q = L Lᵀ, (d, d), read-only."""
-        _, lower = self._noise(t, dt)
-        return lower
+        return _factor_noise(self._noise_cov(t, dt).tobytes(), self.dim)
 
-    def _noise(self, t: float, dt: float) -> tuple[Array, Array]:
-        """Return the noise covariance and its factor, both validated."""
+    def _noise_cov(self, t: float, dt: float) -> Array:
+        """Return the noise covariance, checked and read-only."""
         q = call_user(self.noise_cov, t, dt)
-        # Whether it is finite is checked with its factor, once for each value.
+        # Whether it is finite and a covariance is checked once for each value.
         q = check_array(q, "noise_cov", (self.dim, self.dim), finite=False)
-        return _factorize_noise(q.tobytes(), self.dim)
+        return _check_noise(q.tobytes(), self.dim)
 
     @validated
     def sample_step(
@@ -164,7 +167,7 @@ class Model(FrozenModel):
     ) -> Array:
         """Move states (..., d) from `t` to `t` + `dt` and add a draw of the noise to each."""
         forecast = self.step(x, t, dt)
-        _, lower = self._noise(t, dt)
+        lower = self.noise_sqrt(t, dt)
         standard = rng.standard_normal(forecast.shape)
         # w = L z; rows are states, so z multiplies Lᵀ. A contiguous copy of it is faster.
         sample = standard @ np.ascontiguousarray(lower.T)
@@ -191,13 +194,15 @@ class Model(FrozenModel):
         >>> still.jacobian([1e9], 0.0, 1.0, std=[10.0]).round(6)
         array([[1.]])
         """
+        shape = (*x.shape, self.dim)
+        if self.derivative is not None and not needs_differences(self):
+            return call_derivative(self.derivative, (x, t, dt), shape)
 
         def move(states: Array) -> Array:
             return self.step(states, t, dt)
 
         difference = self._subtract if self.periods else np.subtract
         differences = partial(difference_with_error, move, x, difference, scale=std)
-        shape = (*x.shape, self.dim)
         return evaluate_derivative(
             self,
             (x, t, dt),
@@ -211,15 +216,21 @@ class Model(FrozenModel):
 
 
 @lru_cache(maxsize=64)
-def _factorize_noise(data: bytes, dim: int) -> tuple[Array, Array]:
-    """Return a covariance and its factor, cached: few of them recur in every step of a run."""
+def _check_noise(data: bytes, dim: int) -> Array:
+    """Return a covariance that is one, cached: few of them recur in every step of a run."""
+    # The array is read-only, as all callers share it.
     cov = np.frombuffer(data).reshape(dim, dim)
     check_array(cov, "noise_cov")
     check_positive_semidefinite(cov, "noise_cov")
-    lower = factor(cov)
-    # The cached arrays are shared by all callers.
+    return cov
+
+
+@lru_cache(maxsize=64)
+def _factor_noise(data: bytes, dim: int) -> Array:
+    """Return the factor of a covariance, cached and read-only; only draws need it."""
+    lower = factor(np.frombuffer(data).reshape(dim, dim))
     lower.setflags(write=False)
-    return cov, lower
+    return lower
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,14 +308,14 @@ class LinearModel(Model):
             return np.asarray(x @ _transpose_transition(self, dt))
         return call_batched(self, "transition", (x,), t, dt)
 
-    def _noise(self, t: float, dt: float) -> tuple[Array, Array]:
+    def _noise_cov(self, t: float, dt: float) -> Array:
         if self.time_invariant:
             return _noise_of_step(self, dt)
-        return self._compute_noise(t, dt)
+        return self._compute_noise_cov(t, dt)
 
-    def _compute_noise(self, t: float, dt: float) -> tuple[Array, Array]:
-        """Compute what `_noise` returns, Q and L with Q = L Lᵀ; once, check Φ against Q."""
-        cov, lower = super()._noise(t, dt)
+    def _compute_noise_cov(self, t: float, dt: float) -> Array:
+        """Compute what `_noise_cov` returns; once, check Φ against Q."""
+        cov = super()._noise_cov(t, dt)
         if dt and is_first_use(self, "transition_matrix"):
             # The check calls the user's functions for half steps, at which they may fail, as a
             # table without such an entry does: then nothing is checked.
@@ -318,7 +329,7 @@ class LinearModel(Model):
                         RuntimeWarning,
                         stacklevel=4,
                     )
-        return cov, lower
+        return cov
 
     def _is_transposed(self, t: float, dt: float, cov: Array) -> bool:
         """Whether Φᵀ in place of Φ makes two half steps add the noise of a whole step."""
@@ -413,9 +424,9 @@ def _transpose_transition(model: LinearModel, dt: float) -> Array:
 
 
 @lru_cache(maxsize=64)
-def _noise_of_step(model: LinearModel, dt: float) -> tuple[Array, Array]:
-    """Return Q and its factor of a time-invariant model, made once for each dt."""
-    return model._compute_noise(0.0, dt)
+def _noise_of_step(model: LinearModel, dt: float) -> Array:
+    """Return Q of a time-invariant model, made once for each dt."""
+    return model._compute_noise_cov(0.0, dt)
 
 
 @validated

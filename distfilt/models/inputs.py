@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, ClassVar
@@ -28,7 +28,10 @@ from ..validation import (
 )
 from .base import Model
 
-__all__ = ["InputModel", "Inputs"]
+__all__ = ["InputModel", "Inputs", "Piece", "add_up_noise", "move_by_inputs"]
+
+Piece = tuple[float, float, Array]
+"""A part of a step in which one input holds: when it begins, its length, and the input."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +63,7 @@ class Inputs(FrozenModel):
         if not len(self.times):
             raise ValueError("times must have at least one entry, got none")
 
-    def pieces(self, t: float, dt: float) -> list[tuple[float, float, Array]]:
+    def pieces(self, t: float, dt: float) -> list[Piece]:
         """Return the parts of a step in which one input holds: begin, length and input."""
         if t < self.times[0]:
             raise ValueError(
@@ -165,24 +168,9 @@ class InputModel(Model):
         self, x: Annotated[ArrayInput, "... self.dim"], t: float, dt: NonNegativeFloat
     ) -> Array:
         """Covariance of the noise that a step from states (..., d) adds, (..., d, d)."""
-        cov = np.zeros((*x.shape, self.dim))
-        for _, length, u in self.inputs.pieces(t, dt):
-            inputs = np.broadcast_to(u, (*x.shape[:-1], u.size))
-            slope, gain = self._derivatives(x, inputs, length)
-            # F P Fᵀ of the earlier inputs' noise, and G Σ Gᵀ of this one's
-            cov = slope @ cov @ slope.mT + gain @ self.inputs.cov @ gain.mT
-            x = _move(self.driven_transition, x, inputs, length)
-        return symmetrise(cov) + self.Q(t, dt)
-
-    def _derivatives(self, x: Array, u: Array, dt: float) -> tuple[Array, Array]:
-        """Return the derivatives of a piece by the states and by the inputs."""
-        d = x.shape[-1]
-
-        def move(joint: Array) -> Array:
-            return _move(self.driven_transition, joint[..., :d], joint[..., d:], dt)
-
-        slope = central_difference(move, np.concatenate([x, u], axis=-1), np.subtract)
-        return slope[..., :d], slope[..., d:]
+        pieces = self.inputs.pieces(t, dt)
+        cov = add_up_noise(self.driven_transition, pieces, x, self.inputs.cov)
+        return cov + self.Q(t, dt)
 
 
 def _no_noise(dim: int, t: float, dt: float) -> Array:
@@ -196,10 +184,52 @@ def _drive(
     t: float,
     dt: float,
 ) -> Array:
-    """Move states by the inputs as they were measured."""
-    for _, length, u in inputs.pieces(t, dt):
+    """Move states (..., d) from `t` to `t` + `dt` by the measured inputs, without their noise."""
+    return move_by_inputs(driven_transition, inputs.pieces(t, dt), x)
+
+
+def move_by_inputs(
+    driven_transition: Callable[[Array, Array, float], Array],
+    pieces: Iterable[Piece],
+    x: Array,
+) -> Array:
+    """Move states (..., d) by one input after the other, which broadcast to them."""
+    for _, length, u in pieces:
         x = _move(driven_transition, x, u, length)
     return x
+
+
+def add_up_noise(
+    driven_transition: Callable[[Array, Array, float], Array],
+    pieces: Iterable[Piece],
+    x: Array,
+    cov: Array,
+) -> Array:
+    """Return the noise that inputs with a covariance (..., k, k) add to states (..., d).
+
+    >>> def move(x, u, dt):
+    ...     return x + dt * u
+    >>> two = [(0.0, 1.0, np.ones(1)), (1.0, 2.0, np.ones(1))]
+    >>> add_up_noise(move, two, np.zeros((1, 1)), np.eye(1)).round(6)
+    array([[[5.]]])
+    """
+    d = x.shape[-1]
+    total = np.zeros((*x.shape, d))
+    for _, length, u in pieces:
+        inputs = np.broadcast_to(u, (*x.shape[:-1], u.shape[-1]))
+
+        def move(joint: Array, dt: float = length) -> Array:
+            return _move(driven_transition, joint[..., :d], joint[..., d:], dt)
+
+        # The derivatives of a piece by the states and by the inputs, at once
+        joint = np.concatenate([x, inputs], axis=-1)
+        slope = central_difference(move, joint, np.subtract)
+        f = slope[..., :d]
+        g = slope[..., d:]
+        # F P Fᵀ of the earlier inputs' noise, and G Σ Gᵀ of this one's
+        total = f @ total @ f.mT + g @ cov @ g.mT
+        x = _move(driven_transition, x, inputs, length)
+    return symmetrise(total)
 
 
 def _move(

@@ -79,6 +79,7 @@ def _straight_transition(dt: float, axes: int) -> Array:
 
 
 def _straight_noise(t: float, dt: float, sigma: float, axes: int) -> Array:
+    """Return the covariance of a step with white acceleration, positions before velocities."""
     q = sigma**2
     # σ² (dt³/3, dt²/2; dt²/2, dt), the integral of white acceleration
     position = q * (dt**3 / 3)
@@ -90,8 +91,10 @@ def _straight_noise(t: float, dt: float, sigma: float, axes: int) -> Array:
 @lru_cache(maxsize=64)
 def _repeat_along_axes(block: tuple[tuple[float, float], ...], axes: int) -> Array:
     """Kronecker product of a block with I, read-only and cached: few recur in every step."""
-    # All positions, then all velocities: block ⊗ I.
-    matrix = np.asarray(np.kron(block, np.eye(axes)), dtype=np.float64)
+    # All positions, then all velocities: block ⊗ I, the block at each axis's places.
+    matrix = np.zeros((2 * axes, 2 * axes))
+    places = np.arange(axes)
+    matrix.reshape(2, axes, 2, axes)[:, places, :, places] = block
     matrix.setflags(write=False)
     return matrix
 
@@ -232,6 +235,7 @@ def lorenz63(*, sigma: NoiseStrength = 0.0, step: PositiveFloat = 0.01) -> Model
 
 
 def _lorenz_rate(state: Array, t: float) -> Array:
+    """Return the time derivatives (..., 3) of states of the Lorenz-63 equations."""
     x = state[..., 0]
     y = state[..., 1]
     z = state[..., 2]

@@ -47,6 +47,7 @@ J2 = 1.08262668e-3
 
 
 def _check_outside(value: Array, name: str) -> None:
+    """Refuse positions (..., 3) inside the Earth."""
     least = float(np.linalg.norm(value, axis=-1).min(initial=np.inf))
     # Written so that NaN is refused too.
     if not least >= RADIUS:

@@ -77,6 +77,7 @@ def pendulum_rate(
 
 
 def _rate(states: Array, t: float, length: float, g: float, printed: bool) -> Array:
+    """Return the time derivatives (..., 4) of states (x, y, u, v), with u and v the velocities."""
     x = states[..., 0]
     y = states[..., 1]
     u = states[..., 2]
@@ -170,6 +171,7 @@ def pendulum_angle(
 
 
 def _angle_rate(chart: Array, t: float, ratio: float) -> Array:
+    """Return the time derivatives (..., 2) of states (θ, θ̇); `ratio` is g/L."""
     rate = np.empty_like(chart)
     rate[..., 0] = chart[..., 1]
     # θ̈ = -(g/L) sin θ

@@ -139,6 +139,7 @@ def satellite_pose(
 
 
 def _pose_noise(t: float, dt: float, rate: float, sigma: float) -> Array:
+    """Return the covariance of a step of relative motion, angular velocity and attitude."""
     cov = np.zeros((13, 13))
     cov[:6, :6] = _noise(t, dt, rate, sigma)
     # No torque but white noise; the quaternion has none.
@@ -147,6 +148,7 @@ def _pose_noise(t: float, dt: float, rate: float, sigma: float) -> Array:
 
 
 def _pose_transition(x: Array, t: float, dt: float, rate: float, step: float) -> Array:
+    """Move states (..., 13): the translation exactly, the attitude by Runge-Kutta steps."""
     translation = x[..., :6] @ _transition_matrix(dt, rate).T
     # Components first: each operation then runs over contiguous memory.
     rows = np.ascontiguousarray(x.reshape(-1, 13)[:, 6:].T)

@@ -171,6 +171,7 @@ class Swarm(FrozenModel):
     def _step(
         self, x: Array, t: float, dt: float, rng: np.random.Generator, substeps: int
     ) -> Array:
+        """Move positions (..., d) from `t` to `t` + `dt`, reflected at the walls."""
         # Equal substeps of the Euler-Maruyama scheme
         h = dt / substeps
         for k in range(substeps):

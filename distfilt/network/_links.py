@@ -37,6 +37,7 @@ def from_matrix(value: object, name: str, *, directed: bool) -> scipy.sparse.csr
 
 
 def _check_symmetric(links: scipy.sparse.csr_array, name: str) -> None:
+    """Refuse links (A, A) that lead one way only."""
     # A link without its opposite leaves an entry of 1 or -1 in A - Aᵀ.
     i, j = (links - links.T).nonzero()
     if i.size:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from copy import copy
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, cast
 
@@ -162,7 +161,8 @@ class Channel:
 
         A single run, an array without axes, loses the messages that it loses among all.
         """
-        channel = copy(self)
+        channel = object.__new__(type(self))
+        vars(channel).update(vars(self))
         channel.runs = run.shape
         channel._ledger = ledger
         channel._uncharged = {}
@@ -285,7 +285,11 @@ class Channel:
         on_loss: LossRule = "mutual",
         rounds: PositiveInt = 1,
     ) -> Array:
-        """Let every agent replace its value by a weighted sum of it and the received ones.
+        r"""Let every agent replace its value by a weighted sum of it and the received ones.
+
+        .. math:: \mathbf x_i\leftarrow w_{ii}\mathbf x_i+\sum_j w_{ij}\mathbf x_j
+
+        The sum is over the agents j from which i has a link.
 
         Parameters
         ----------
@@ -296,15 +300,20 @@ class Channel:
         on_loss : {"mutual", "metropolis", "keep", "renormalise", "zero"}
             Where the weight of a lost message goes.
 
-            - ``"mutual"``: a link counts only if both its messages arrive, which acknowledgements
-              tell; its weight goes to the own value on both sides. Keeps the average
-              for symmetric weights.
+            - ``"mutual"``: a link counts only if both its messages arrive, which both ends learn
+              by acknowledgements; otherwise its weight is added to :math:`w_{ii}` at both ends.
+              Keeps the average for symmetric weights.
             - ``"metropolis"``: the same, and the weights are the Metropolis weights of the links
               that are left; the given ones are not used.
             - ``"keep"``: to the receiver's own value. ``"renormalise"``: to all values that it
               has. ``"zero"``: nowhere. These move the average.
         rounds : int
             Number of rounds.
+
+        Returns
+        -------
+        ndarray, (*runs, A, k)
+            The values after the last round.
         """
         _check_same_links(weights, self.graph)
         if self._perfect:
@@ -356,6 +365,7 @@ class Channel:
     def _mix_without_faults(
         self, values: Array, weights: ConsensusWeights, rounds: int
     ) -> Array:
+        """Mix values (*runs, A, k) in rounds in which every message arrives at once."""
         # The ledger is brought up to date when it is read: it would cost more than the
         # product.
         size = values.shape[-1]
@@ -556,17 +566,17 @@ class Channel:
     ) -> list[Counts]:
         """Return what each agent sends, in the order of the ledger's fields."""
         graph = self.graph
-        n_links = used_by_round.size
-        if (
-            size.is_common
-            and size.transmission is not None
-            and not acknowledged
-            and np.count_nonzero(used_by_round) == n_links
-        ):
-            # The usual case: every agent sends the same on all its links.
-            rounds = repeated * len(used_by_round)
-            messages = rounds * graph.messages_a_round
-            sends = rounds * graph.is_sender
+        if size.is_common and size.transmission is not None and not acknowledged:
+            # The usual case: an agent sends the same on all its links, or on those in use.
+            if np.count_nonzero(used_by_round) == used_by_round.size:
+                rounds = repeated * len(used_by_round)
+                messages = rounds * graph.messages_a_round
+                sends = rounds * graph.is_sender
+            else:
+                uses = repeated * used_by_round.sum(axis=0)
+                links_in_use = self._count_by_agent(graph.senders, uses)
+                messages = np.asarray(links_in_use, dtype=np.int64)
+                sends = repeated * self._count_transmissions(used_by_round)
             scalars, bytes_ = size.transmission
             links_bill = [messages, messages * scalars, messages * bytes_]
             return [*links_bill, sends, sends * scalars, sends * bytes_]
@@ -679,6 +689,7 @@ def _mask_lost(payload: Payload, arrived: Mask) -> Payload:
 
 
 def _mask_part(payload: Part, arrived: Mask) -> Part:
+    """Return a read-only copy of an array (*runs, ...) with NaN where nothing arrived, (*runs)."""
     # One flag for each run, for all of the payload's other axes.
     axes = (1,) * (payload.ndim - arrived.ndim)
     masked = np.where(arrived.reshape(arrived.shape + axes), payload, np.nan)

@@ -5,16 +5,18 @@ A filter takes one as its ``fusion=``, with :func:`functools.partial` for the op
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from ..ensembles import match_moments, mean, sample_covariance
 from ..gaussians import intersection_weights
-from ..linalg import EPS, cholesky, solve_lower, symmetrise
+from ..linalg import EPS, cholesky, identity, solve_lower, symmetrise
 from ..periods import Periods, wrap_differences
 from ..validation import (
     Array,
@@ -519,11 +521,11 @@ def _repeat_uncertain(
     new_means = means.copy()
     new_covs = covs.copy()
     if is_uncertain.any():
-        block: Any = (..., *np.ix_(is_uncertain, is_uncertain))
+        rows, columns = np.ix_(is_uncertain, is_uncertain)
         periods = _select_periods(channel.periods, is_uncertain)
-        part = (means[..., is_uncertain], covs[block])
+        part = (means[..., is_uncertain], covs[..., rows, columns])
         part = _repeat_all(part, channel, rounds, fuse, periods)
-        new_means[..., is_uncertain], new_covs[block] = part
+        new_means[..., is_uncertain], new_covs[..., rows, columns] = part
     return new_means, new_covs
 
 
@@ -561,6 +563,10 @@ def _intersection_weights(received: _Received, rule: Rule) -> Pair:
         return _optimal_weights(received, rule)
     graph = received.graph
     size = np.ones(received.means.shape[:2])
+    if rule == "equal" and received.arrived.all():
+        # Each agent's number of messages belongs to the graph.
+        total = size + graph.in_degree
+        return size / total, 1 / total[:, graph.receivers]
     if rule != "equal":
         # Weights are proportional to a size of each covariance: its weight against a
         # unit covariance, over that one's. No agent's number depends on another's in
@@ -604,21 +610,36 @@ def _sum_information(
 ) -> Pair:
     """Return mean and covariance of weighted sums of information matrices and vectors."""
     graph = received.graph
+    d = received.means.shape[-1]
     information = _invert(received.covs)
-    covs = _invert(received.sum_matrices(self_weights, link_weights, information))
     # m = m_i + P Σ_j ω_j P_j⁻¹ (m_j - m_i): about the own mean, so that equal means
     # stay and large ones lose no digits.
-    difference = received.mean_differences()[..., None]
-    pull = (information[:, graph.senders] @ difference)[..., 0]
-    total_pull = graph._sum_by_receiver(link_weights[..., None] * pull, 1)
-    shift = (covs @ total_pull[..., None])[..., 0]
+    of_sender = information[:, graph.senders]
+    pull = of_sender @ received.mean_differences()[..., None]
+    # One sum over the links for ω_j P_j⁻¹ and, as a further column, for the pull.
+    terms = np.concatenate([of_sender, pull], axis=-1)
+    terms *= link_weights[..., None, None]
+    total = graph._sum_by_receiver(terms, 1)
+    own_part = self_weights[..., None, None] * information
+    covs = _invert(own_part + total[..., :d])
+    shift = (covs @ total[..., d:])[..., 0]
     return received.means + shift, symmetrise(covs)
 
 
 def _invert(spd: Array) -> Array:
-    """Return inverses of positive definite matrices."""
-    # P = L Lᵀ has the inverse L⁻ᵀ L⁻¹.
-    lower = cholesky(spd)
-    identity = np.broadcast_to(np.eye(spd.shape[-1]), spd.shape)
-    inverse = solve_lower(lower, identity)
-    return np.asarray(inverse.swapaxes(-1, -2) @ inverse)
+    """Return inverses of positive definite matrices, symmetric up to rounding."""
+    d = spd.shape[-1]
+    n = math.prod(spd.shape[:-2])
+    if n > 2 * d:
+        # P = L Lᵀ has the inverse L⁻ᵀ L⁻¹; many matrices are solved row after row.
+        unit = np.broadcast_to(identity(d), spd.shape)
+        inverse = solve_lower(cholesky(spd), unit)
+        return np.asarray(inverse.swapaxes(-1, -2) @ inverse)
+    # A few matrices are solved faster one by one, P X = I by Cholesky.
+    solutions = []
+    for matrix in spd.reshape(n, d, d):
+        _, solution, failed = dposv(matrix, identity(d), lower=1)
+        if failed:
+            raise np.linalg.LinAlgError("Matrix is not positive definite")
+        solutions.append(solution)
+    return np.array(solutions).reshape(spd.shape)

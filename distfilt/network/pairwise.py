@@ -5,9 +5,9 @@ The result depends on the order, which is that of the senders.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 
@@ -17,11 +17,13 @@ from ..gaussians import (
     intersect_split,
     unite_gaussians,
 )
+from ..gaussians.pairwise import Size
 from ..linalg import symmetrise
-from ..periods import wrap_differences
+from ..periods import align
 from ..validation import (
     Array,
     ArrayInput,
+    Indices,
     Mask,
     PositiveInt,
     PositiveSemidefinite,
@@ -30,6 +32,7 @@ from ..validation import (
 from .channel import Channel, fusion_rule
 from .consensus import _warn_if_disconnected
 from .fusion import Gaussians, Pair, _Received, _repeat
+from .graphs import Graph
 
 __all__ = [
     "covariance_union",
@@ -38,7 +41,6 @@ __all__ = [
     "split_covariance_intersection",
 ]
 
-Size = Literal["min_trace", "min_determinant"]
 PairRule = Callable[[Array, Array, Array, Array], Pair]
 """``rule(mean_a, cov_a, mean_b, cov_b) -> (mean, cov)``, batched."""
 
@@ -216,15 +218,11 @@ def _fuse_parts(
     """Fuse means and parts of covariances (R, A, ...) with those that have arrived."""
     graph = channel.graph
     fused = [part.copy() for part in parts]
-    for turn in range(int(graph.in_degree.max(initial=0))):
-        # All agents with so many neighbours fuse their next one together.
-        agents = np.flatnonzero(graph.in_degree > turn)
-        links = graph.links.indptr[agents] + turn
+    for agents, links in _iterate_neighbours(graph):
         own = [part[:, agents] for part in fused]
         other = [part[:, graph.senders[links]] for part in parts]
-        if channel.periods:
-            # On the receiver's branch of circular components
-            other[0] = own[0] + wrap_differences(other[0] - own[0], channel.periods)
+        # On the receiver's branch of circular components
+        other[0] = align(other[0], own[0], channel.periods)
         new = intersect_split(*own, *other, rule=rule)
         for part, value in zip(fused, new, strict=True):
             # Flags (R, agents) with as many axes as the part
@@ -233,6 +231,14 @@ def _fuse_parts(
             )
             part[:, agents] = np.where(has_arrived, value, part[:, agents])
     return fused
+
+
+def _iterate_neighbours(graph: Graph) -> Iterator[tuple[Indices, Indices]]:
+    """Yield the agents that have a next neighbour, and the links from it, by sender."""
+    for turn in range(int(graph.in_degree.max(initial=0))):
+        # All agents with so many neighbours fuse their next one together.
+        agents = np.flatnonzero(graph.in_degree > turn)
+        yield agents, graph.links.indptr[agents] + turn
 
 
 def _repeat_in_turn(
@@ -251,18 +257,12 @@ def _fuse_in_turn(received: _Received, pair_rule: PairRule) -> Pair:
     graph = received.graph
     means = received.means.copy()
     covs = received.covs.copy()
-    for turn in range(int(graph.in_degree.max(initial=0))):
-        # All agents that have received so many fuse their next one together.
-        agents = np.flatnonzero(graph.in_degree > turn)
-        links = graph.links.indptr[agents] + turn
+    for agents, links in _iterate_neighbours(graph):
         senders = graph.senders[links]
         own_mean = means[:, agents]
-        other_mean = received.means[:, senders]
-        if received.periods:
-            # On the receiver's branch of circular components
-            difference = wrap_differences(other_mean - own_mean, received.periods)
-            other_mean = own_mean + difference
         own_cov = covs[:, agents]
+        # On the receiver's branch of circular components
+        other_mean = align(received.means[:, senders], own_mean, received.periods)
         new_mean, new_cov = pair_rule(
             own_mean, own_cov, other_mean, received.covs[:, senders]
         )

@@ -19,7 +19,12 @@ from typing import Annotated, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..derivatives import difference_with_error, evaluate_derivative
+from ..derivatives import (
+    call_derivative,
+    difference_with_error,
+    evaluate_derivative,
+    needs_differences,
+)
 from ..linalg import broadcast_leading, factor
 from ..periods import Periods, PeriodsArgument, align, read_periods, wrap_differences
 from ..validation import (
@@ -334,6 +339,8 @@ class Sensor(FrozenModel):
         # A linear sensor has the same matrix H at every state.
         if self.linear is not None:
             return np.broadcast_to(self.H(d), shape)
+        if self.derivative is not None and not needs_differences(self):
+            return call_derivative(self.derivative, states, shape)
 
         # The previous states stay fixed while the present one is varied along a new
         # axis.

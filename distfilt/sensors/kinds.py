@@ -166,6 +166,7 @@ def distance(
     *,
     std: Deviation,
     origin: Annotated[ArrayInput, "n"] | None = None,
+    observer: DistinctIndices | None = None,
 ) -> Sensor:
     """Measure the distance of some components from a place, ``h(x) = |x[indices] - origin|``.
 
@@ -178,6 +179,9 @@ def distance(
     origin : array_like, (n,), optional
         The place of the sensor, one coordinate for each of the n indices; zero by
         default.
+    observer : sequence of n int, optional
+        The components that hold the sensor's place, if the sensor is on a body of the
+        state: ``h(x) = |x[indices] - x[observer]|``.
 
     Notes
     -----
@@ -187,12 +191,14 @@ def distance(
     --------
     >>> distance([0, 1], std=0.1).predict([3.0, 4.0, 9.0])
     array([5.])
+    >>> distance([0, 1], std=0.1, observer=[2, 3]).predict([3.0, 4.0, 3.0, 6.0])
+    array([2.])
     """
     if origin is not None and len(origin) != len(indices):
         raise ValueError(
             f"origin must have shape ({len(indices)},), got {origin.shape}"
         )
-    geometry = _geometry(indices, origin)
+    geometry = _geometry(indices, origin, observer)
     return Sensor.construct(
         1,
         partial(_distance, **geometry),
@@ -204,7 +210,11 @@ def distance(
 
 @validated
 def bearing(
-    indices: Pair, *, std: AngleDeviation, origin: Point | None = None
+    indices: Pair,
+    *,
+    std: AngleDeviation,
+    origin: Point | None = None,
+    observer: DistinctIndices | None = None,
 ) -> Sensor:
     """Measure the direction of two components (a, b), ``arctan2(b, a)``, with period 2π.
 
@@ -216,6 +226,8 @@ def bearing(
         Standard deviation, in rad, positive and at most π.
     origin : array_like, (2,), optional
         The place of the sensor; zero by default.
+    observer : sequence of two or three int, optional
+        As of :func:`range_bearing`.
 
     Notes
     -----
@@ -234,7 +246,7 @@ def bearing(
     >>> sensor.residual([3.0], [-3.0]).round(4)
     array([-0.2832])
     """
-    return _angle_sensor("bearing", indices, std, origin, period=2 * np.pi)
+    return _angle_sensor("bearing", indices, std, origin, observer, period=2 * np.pi)
 
 
 @validated
@@ -268,13 +280,19 @@ def line_angle(
     >>> sensor.residual([1.5], [-1.5]).round(4)
     array([-0.1416])
     """
-    return _angle_sensor("line_angle", indices, std, origin, period=np.pi)
+    return _angle_sensor("line_angle", indices, std, origin, None, period=np.pi)
 
 
 def _angle_sensor(
-    kind: str, indices: Sequence[int], std: float, origin: Array | None, period: float
+    kind: str,
+    indices: Sequence[int],
+    std: float,
+    origin: Array | None,
+    observer: Sequence[int] | None,
+    period: float,
 ) -> Sensor:
-    geometry = _geometry(indices, origin)
+    """Return the sensor of a direction or of the angle of a line, by its period."""
+    geometry = _geometry(indices, origin, observer, has_heading=True)
     return Sensor.construct(
         1,
         partial(_angle, period=period, **geometry),
@@ -292,6 +310,7 @@ def range_bearing(
     std: tuple[Deviation, AngleDeviation],
     origin: Point | None = None,
     heading: float = 0.0,
+    observer: DistinctIndices | None = None,
 ) -> Sensor:
     """Measure the distance and the bearing of two components, as a radar or a robot does.
 
@@ -307,6 +326,9 @@ def range_bearing(
     heading : float
         The sensor's heading, in rad from the first axis to the second: the bearing is
         measured from there, with period 2π.
+    observer : sequence of two or three int, optional
+        The components that hold the sensor's place, or its place and heading, if the
+        sensor is on a body of the state, such as a robot that estimates its own pose.
 
     Notes
     -----
@@ -319,8 +341,18 @@ def range_bearing(
     >>> radar = range_bearing([0, 1], std=[0.5, 0.01], origin=[1.0, 0.0])
     >>> radar.predict([1.0, 2.0]).round(4)
     array([2.    , 1.5708])
+
+    A robot at (1, 0) that heads north sees a landmark of the state, two metres ahead:
+
+    >>> camera = range_bearing([3, 4], std=[0.1, 0.02], observer=[0, 1, 2])
+    >>> camera.predict([1.0, 0.0, np.pi / 2, 1.0, 2.0]).round(4)
+    array([2., 0.])
     """
-    geometry = _geometry(indices, origin)
+    if observer is not None and heading:
+        raise ValueError(
+            f"heading must be 0 for a sensor on a body of the state, got {heading:g}"
+        )
+    geometry = _geometry(indices, origin, observer, has_heading=True)
     return Sensor.construct(
         2,
         partial(_range_bearing, heading=heading, **geometry),
@@ -337,18 +369,53 @@ class _Geometry(TypedDict):
 
     indices: Sequence[int]
     origin: Array
+    observer: Sequence[int]
 
 
-def _geometry(indices: Sequence[int], origin: Array | None) -> _Geometry:
-    """Return the components that form a place, and the place of the sensor as an own copy."""
+def _geometry(
+    indices: Sequence[int],
+    origin: Array | None,
+    observer: Sequence[int] | None = None,
+    *,
+    has_heading: bool = False,
+) -> _Geometry:
+    """Return the components that form a place, and the place of the sensor as an own copy.
+
+    An observer has as many components as a place, and a heading behind them if
+    `has_heading` allows it.
+    """
     # A copy: the caller's array may be that of a robot that moves on.
     place = np.array(0.0 if origin is None else origin)
-    return {"indices": indices, "origin": place}
+    if observer is None:
+        return {"indices": indices, "origin": place, "observer": ()}
+    if origin is not None:
+        raise ValueError("origin must be None for a sensor on a body of the state")
+    n = len(indices)
+    if len(observer) not in (n, n + has_heading):
+        expected = f"{n} or {n + 1}" if has_heading else str(n)
+        raise ValueError(
+            f"observer must have {expected} components, got {len(observer)}"
+        )
+    if set(observer) & set(indices):
+        raise ValueError(
+            f"observer must have other components than indices, got {list(observer)}"
+        )
+    return {"indices": indices, "origin": place, "observer": observer}
 
 
-def _offset(x: Array, indices: Sequence[int], origin: Array) -> Array:
+def _offset(
+    x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
+) -> Array:
     """Return the vector from the sensor to the place that some components form."""
-    return np.asarray(x[..., list(indices)] - origin)
+    place = x[..., list(observer[: len(indices)])] if observer else origin
+    return np.asarray(x[..., list(indices)] - place)
+
+
+def _own_heading(x: Array, indices: Sequence[int], observer: Sequence[int]) -> Array:
+    """Return the heading of a sensor on a body of the state, zero without one."""
+    if len(observer) <= len(indices):
+        return np.zeros(x.shape[:-1])
+    return np.asarray(x[..., observer[len(indices)]])
 
 
 def _norm(vectors: Array) -> Array:
@@ -356,31 +423,53 @@ def _norm(vectors: Array) -> Array:
     return np.asarray(np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True)))
 
 
-def _scatter(slope: Array, indices: Sequence[int], dim: int) -> Array:
-    """Return derivatives (..., m, n) in picked components as those in all `dim` of them."""
+def _scatter(
+    slope: Array, indices: Sequence[int], observer: Sequence[int], dim: int
+) -> Array:
+    """Return derivatives (..., m, n) by an offset as those by all `dim` components."""
     # The other components do not enter.
     jacobian = np.zeros((*slope.shape[:-1], dim))
     jacobian[..., list(indices)] = slope
+    if observer:
+        jacobian[..., list(observer[: len(indices)])] = -slope
     return jacobian
 
 
-def _distance(x: Array, indices: Sequence[int], origin: Array) -> Array:
-    return _norm(_offset(x, indices, origin))
+def _distance(
+    x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
+) -> Array:
+    """Return distances (..., 1) of states (..., d) from the sensor."""
+    return _norm(_offset(x, indices, origin, observer))
 
 
-def _distance_jacobian(x: Array, indices: Sequence[int], origin: Array) -> Array:
-    # ∂|v|/∂v = vᵀ / |v|, and zero at v = 0.
-    offset = _offset(x, indices, origin)
-    length = _norm(offset)
-    slope = offset / np.where(length > 0, length, 1.0)
-    return _scatter(slope[..., None, :], indices, x.shape[-1])
+def _distance_jacobian(
+    x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
+) -> Array:
+    """Return the derivatives (..., 1, d) of distances."""
+    offset = _offset(x, indices, origin, observer)
+    slope = _distance_slope(offset, _norm(offset))
+    return _scatter(slope[..., None, :], indices, observer, x.shape[-1])
 
 
-def _angle(x: Array, period: float, indices: Sequence[int], origin: Array) -> Array:
-    return _direction(_offset(x, indices, origin), period)
+def _distance_slope(offset: Array, length: Array) -> Array:
+    """Return the derivative of vectors' lengths, and zero at the vector zero."""
+    # ∂|v|/∂v = vᵀ / |v|
+    return np.asarray(offset / np.where(length > 0, length, 1.0))
 
 
-def _direction(offset: Array, period: float, heading: float = 0.0) -> Array:
+def _angle(
+    x: Array,
+    period: float,
+    indices: Sequence[int],
+    origin: Array,
+    observer: Sequence[int],
+) -> Array:
+    """Return directions (..., 1) of states (..., d) from the sensor."""
+    offset = _offset(x, indices, origin, observer)
+    return _direction(offset, period, _own_heading(x, indices, observer))
+
+
+def _direction(offset: Array, period: float, heading: float | Array) -> Array:
     """Return the angles of vectors (..., 2) from a heading, NaN for the vector zero."""
     angle = np.arctan2(offset[..., 1], offset[..., 0])
     # arctan2(0, 0) is 0, but the sensor's own place has no direction.
@@ -388,32 +477,61 @@ def _direction(offset: Array, period: float, heading: float = 0.0) -> Array:
     return wrap(angle - heading, period=period)[..., None]
 
 
-def _angle_jacobian(x: Array, indices: Sequence[int], origin: Array) -> Array:
+def _angle_jacobian(
+    x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
+) -> Array:
+    """Return the derivatives (..., 1, d) of directions, NaN at the sensor's own place."""
+    offset = _offset(x, indices, origin, observer)
+    slope = _angle_slope(offset, _norm(offset))
+    jacobian = _scatter(slope[..., None, :], indices, observer, x.shape[-1])
+    if len(observer) > len(indices):
+        # The bearing decreases as the sensor turns; NaN where there is none.
+        jacobian[..., 0, observer[len(indices)]] = -1.0 + 0.0 * slope[..., 0]
+    return jacobian
+
+
+def _angle_slope(offset: Array, length: Array) -> Array:
+    """Return the derivative of vectors' angles, and NaN at the vector zero."""
     # ∂ arctan2(b, a) / ∂(a, b) = (-b, a) / (a² + b²); by unit vectors, so that no
     # square overflows.
-    offset = _offset(x, indices, origin)
-    length = _norm(offset)
     length = np.where(length > 0, length, np.nan)
     unit = offset / length
-    slope = np.stack([-unit[..., 1], unit[..., 0]], axis=-1) / length
-    return _scatter(slope[..., None, :], indices, x.shape[-1])
+    slope = np.empty(unit.shape)
+    slope[..., 0] = -unit[..., 1]
+    slope[..., 1] = unit[..., 0]
+    slope /= length
+    return slope
 
 
 def _range_bearing(
-    x: Array, heading: float, indices: Sequence[int], origin: Array
+    x: Array,
+    heading: float,
+    indices: Sequence[int],
+    origin: Array,
+    observer: Sequence[int],
 ) -> Array:
-    offset = _offset(x, indices, origin)
-    angle = _direction(offset, 2 * np.pi, heading)
+    """Return distances and bearings (..., 2) of states (..., d) from the sensor."""
+    offset = _offset(x, indices, origin, observer)
+    total_heading = heading + _own_heading(x, indices, observer)
+    angle = _direction(offset, 2 * np.pi, total_heading)
     return np.concatenate([_norm(offset), angle], axis=-1)
 
 
-def _range_bearing_jacobian(x: Array, indices: Sequence[int], origin: Array) -> Array:
-    # The heading only shifts the bearing, so that it does not enter.
-    rows = [
-        _distance_jacobian(x, indices, origin),
-        _angle_jacobian(x, indices, origin),
-    ]
-    return np.concatenate(rows, axis=-2)
+def _range_bearing_jacobian(
+    x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
+) -> Array:
+    """Return the derivatives (..., 2, d) of distances and bearings."""
+    # A constant heading only shifts the bearing, so that it does not enter.
+    offset = _offset(x, indices, origin, observer)
+    length = _norm(offset)
+    slopes = np.empty((*offset.shape[:-1], 2, 2))
+    slopes[..., 0, :] = _distance_slope(offset, length)
+    slopes[..., 1, :] = _angle_slope(offset, length)
+    jacobian = _scatter(slopes, indices, observer, x.shape[-1])
+    if len(observer) > len(indices):
+        turn = observer[len(indices)]
+        jacobian[..., 1, turn] = -1.0 + 0.0 * slopes[..., 1, 0]
+    return jacobian
 
 
 # The direction to a body in space.
@@ -464,6 +582,7 @@ def angles_only(
 def _angles_only(
     x: Array, form: str, observer: int, hidden: Callable[[Array, Array], Array] | None
 ) -> Array:
+    """Return both angles (..., 2) of the line of sight in states (..., d); NaN if it is hidden."""
     target = x[..., :3]
     place = x[..., observer : observer + 3]
     # The line of sight, observer to target.
@@ -595,6 +714,7 @@ def _stack_matrices(dim: int, sensors: Sequence[Sensor]) -> Array:
 def _stack_residuals(
     observed: Array, predicted: Array, sensors: Sequence[Sensor]
 ) -> Array:
+    """Return the residuals (..., M) of stacked sensors, each by the rule of its sensor."""
     # Each sensor takes its own part of the components.
     ends = np.cumsum([sensor.dim for sensor in sensors])[:-1]
     observed_parts = np.split(observed, ends, axis=-1)

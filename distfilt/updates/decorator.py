@@ -16,6 +16,7 @@ from types import EllipsisType
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from ..ensembles import Ensemble
 from ..linalg import broadcast_leading, cholesky
@@ -352,7 +353,13 @@ class RowGenerator(Rng):
         self.rows = rows
         self.is_partial = rows.size != math.prod(lead)
 
-    def permuted(self, x: Any, *, axis: int | None = None, out: Any = None) -> Any:
+    def permuted(
+        self,
+        x: ArrayLike,
+        *,
+        axis: int | None = None,
+        out: NDArray[np.generic] | None = None,
+    ) -> NDArray[np.generic]:
         """Permute as numpy does, the slices of each row by draws of the row's own."""
         values = np.asarray(x)
         if not self._has_rows(values.shape) or axis is None:
@@ -376,7 +383,7 @@ class RowGenerator(Rng):
         whole[self.rows] = values
         return whole.reshape(*self.lead, *values.shape[1:])
 
-    def _spread(self, parameter: Any, n_axes: int) -> Any:
+    def _spread(self, parameter: ArrayLike, n_axes: int) -> ArrayLike:
         """Return a parameter of draws with so many axes as one for the whole batch."""
         values = np.asarray(parameter)
         # A parameter without an axis of rows is that of all rows.
@@ -444,7 +451,9 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
 """Further arguments that may be given by position, after ``size``."""
 
 
-def _draw_rows(name: str, parameters: tuple[str, ...], by_row: bool) -> Any:
+def _draw_rows(
+    name: str, parameters: tuple[str, ...], by_row: bool
+) -> Callable[..., Array]:
     """Return the method of a distribution that draws for the batch and selects the rows."""
     draw = getattr(np.random.Generator, name)
     names = (*parameters, "size", *_OPTIONS.get(name, ()))

@@ -117,7 +117,7 @@ def with_projection(
     variant: Literal["printed", "reversed", "particle", "shift"] = "shift",
     regularisation: NonNegativeFloat = 1e-6,
 ) -> Update:
-    """Project the analysis members by regression, equations (6)-(12), in every update.
+    """Project the analysis members by regression in every update.
 
     Parameters
     ----------
@@ -129,8 +129,13 @@ def with_projection(
     Returns
     -------
     callable
-        An update; with :func:`etpf` it is OTNLeq. OTProj projects the reported members only and
-        continues from the others: call :func:`distfilt.coupling.project` on recorded members.
+        An update; with :func:`etpf` it is the paper's OTNLeq. The paper's OTProj projects the
+        reported members only and continues from the others: for it call
+        :func:`distfilt.coupling.project` on recorded members.
+
+    Notes
+    -----
+    Equations (6)-(12) of Das and Bhattacharya.
 
     Examples
     --------
@@ -198,7 +203,7 @@ def with_retraction(
 def with_augmentation(
     update: Update, constraint: Constraint, *, std: PositiveFloat
 ) -> Update:
-    r"""Observe the constraint too, as a nearly perfect measurement, equation (13).
+    r"""Observe the constraint too, as a nearly perfect measurement: Das and Bhattacharya, (13).
 
     Parameters
     ----------

@@ -252,13 +252,33 @@ def check_positive_semidefinite(value: Array, name: str) -> None:
     --------
     >>> check_positive_semidefinite(np.zeros((2, 2)), "noise")
     """
+    if _is_nonnegative_diagonal(value):
+        return
     _check_symmetric(value, name)
-    if _has_cholesky(value):
+    # A noise that leaves some components alone has zeros there, which need no look.
+    if _has_cholesky(_drop_constants(value)):
         return
     # Rounding alone may have made an eigenvalue negative.
     smallest = _smallest_eigenvalues(value)
     if smallest.min() < -_ROUNDING:
         _raise_not_positive(value, name, smallest, "semidefinite")
+
+
+def _is_nonnegative_diagonal(value: Array) -> bool:
+    """Whether a single square matrix is diagonal, without a negative number or NaN.
+
+    >>> (
+    ...     _is_nonnegative_diagonal(np.diag([1.0, 0.0])),
+    ...     _is_nonnegative_diagonal(-np.eye(2)),
+    ... )
+    (True, False)
+    """
+    if value.ndim != 2 or value.shape[0] != value.shape[1]:
+        return False
+    diagonal = value.diagonal()
+    if np.count_nonzero(value) > np.count_nonzero(diagonal):
+        return False
+    return bool(np.count_nonzero(diagonal >= 0) == diagonal.size)
 
 
 def _check_symmetric(value: Array, name: str) -> None:
@@ -288,6 +308,22 @@ def _has_cholesky(value: Array) -> bool:
         np.linalg.cholesky(value)
         return True
     return False
+
+
+def _drop_constants(value: Array) -> Array:
+    """Return a single matrix without the rows and columns that are zero; others as they are.
+
+    >>> _drop_constants(np.diag([2.0, 0.0]))
+    array([[2.]])
+    """
+    if value.ndim > 2:
+        return value
+    kept = np.flatnonzero(value.diagonal())
+    if kept.size == len(value):
+        return value
+    part = value[kept][:, kept]
+    # Beside a zero on the diagonal, anything but zeros makes the matrix indefinite.
+    return part if np.count_nonzero(part) == np.count_nonzero(value) else value
 
 
 def _smallest_eigenvalues(value: Array) -> Array:

@@ -6,13 +6,13 @@ Nested calls skip it, and so does a dataclass that the library constructs.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from contextvars import ContextVar
 from dataclasses import Field, fields
 from functools import cache, cached_property, partial, wraps
 from inspect import Parameter, get_annotations, signature
 from math import isfinite
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast
+from typing import TYPE_CHECKING, ClassVar, Self, TypeVar, cast
 
 import numpy as np
 
@@ -303,8 +303,8 @@ class FrozenModel:
     """Whether the constructor checked this instance; not if the library constructed it."""
 
     def __post_init__(self) -> None:
-        # Any: mypy does not take a class for hashable, as the cache asks for.
-        cls: Any = type(self)
+        # mypy does not take a class for hashable, as the cache asks for.
+        cls = cast(Hashable, type(self))
         context = CallContext(dict(vars(self)))
         # Shapes refer to fields by name, as they do to arguments in a call.
         values = context.arguments
@@ -319,7 +319,7 @@ class FrozenModel:
         """Build an instance of values that the library made: nothing is checked or copied."""
         # Past __init__, and so past the checks.
         instance = object.__new__(cls)
-        dataclass: Any = cls
+        dataclass = cast(Hashable, cls)
         names, factories = _fields(dataclass)
         values = vars(instance)
         values.update(zip(names, args, strict=False), **options)
@@ -330,7 +330,7 @@ class FrozenModel:
 
     def replace(self, **changes: object) -> Self:
         """Return a copy with other values in some fields, unchecked."""
-        cls: Any = type(self)
+        cls = cast(Hashable, type(self))
         names, _ = _fields(cls)
         values = {name: getattr(self, name) for name in names}
         return self.construct(**values | changes)
@@ -357,7 +357,7 @@ def _fields(
 @cache
 def field_constraints(cls: type[FrozenModel]) -> dict[str, ArgumentConstraint]:
     """Return the constraints of a dataclass's fields, inherited ones included, arrays last."""
-    dataclass: Any = cls
+    dataclass = cast(Hashable, cls)
     names, _ = _fields(dataclass)
     constraints: dict[str, ArgumentConstraint] = {}
     # Base classes first, so that a subclass may narrow the annotation of a field.

@@ -75,7 +75,8 @@ def compare_times(
             function()
             began = time.perf_counter()
             function()
-            calls[name] = max(1, int(seconds / max(time.perf_counter() - began, 1e-7)))
+            spent = max(time.perf_counter() - began, 1e-7)
+            calls[name] = max(1, int(seconds / spent))
         # One turn of each function in every round
         for _ in range(rounds):
             for name, function in functions.items():
@@ -85,11 +86,13 @@ def compare_times(
                 times[name].append((time.process_time() - began) / calls[name])
     first = next(iter(times.values()))
     # Within a round both meet the same disturbance, which cancels in their ratio.
-    ratios = {
-        name: statistics.median(b / a for a, b in zip(first, spent, strict=True))
-        for name, spent in times.items()
-    }
-    return {name: statistics.median(spent) for name, spent in times.items()}, ratios
+    ratios = {}
+    medians = {}
+    for name, spent in times.items():
+        quotients = [b / a for a, b in zip(first, spent, strict=True)]
+        ratios[name] = statistics.median(quotients)
+        medians[name] = statistics.median(spent)
+    return medians, ratios
 
 
 def peer(name: str) -> Any:

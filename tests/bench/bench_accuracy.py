@@ -65,7 +65,8 @@ def errors() -> Iterator[Row]:
     dapper.set_seed(3000)
     draws = [hmm.simulate() for _ in range(RUNS)]
     truth = np.stack([x[hmm.tseq.kko] for x, _ in draws], axis=1)
-    seen = np.stack([np.array([*y]) for _, y in draws], axis=1)
+    series = [np.array([*y]) for _, y in draws]
+    seen = np.stack(series, axis=1)
 
     # Root mean square over components after the burn-in, (T, runs)
     def error(means: Any) -> Any:
@@ -86,8 +87,11 @@ def errors() -> Iterator[Row]:
         theirs = error(np.stack(means, axis=1))
         ratio_of_all = ours.mean() / theirs.mean()
         # Runs in which either filter has lost the track would dominate the averages.
-        lost, lost_theirs = ((x > 4 * STD).any(axis=0) for x in (ours, theirs))
-        ours, theirs = (x.mean(axis=0)[~lost & ~lost_theirs] for x in (ours, theirs))
+        lost = (ours > 4 * STD).any(axis=0)
+        lost_theirs = (theirs > 4 * STD).any(axis=0)
+        is_tracked = ~lost & ~lost_theirs
+        ours = ours.mean(axis=0)[is_tracked]
+        theirs = theirs.mean(axis=0)[is_tracked]
         ratio = ours.mean() / theirs.mean()
         # Both filters see the same data: a standard error of paired differences
         se = (ours - theirs).std(ddof=1) / theirs.mean() / ours.size**0.5

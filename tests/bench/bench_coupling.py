@@ -38,8 +38,10 @@ def solve_by_cvxpy(cost: np.ndarray, w: np.ndarray) -> float:
     t = cp.Variable((n, n), nonneg=True)
     scale = cost.max()
     # Marginals of N T: one equation of the columns follows from the others.
-    ends = [cp.sum(t, axis=0)[:-1] == 1.0, cp.sum(t, axis=1) == n * w]
-    problem = cp.Problem(cp.Minimize(cp.sum(cp.multiply(cost / scale, t))), ends)
+    columns = cp.sum(t, axis=0)[:-1] == 1.0
+    rows = cp.sum(t, axis=1) == n * w
+    total = cp.sum(cp.multiply(cost / scale, t))
+    problem = cp.Problem(cp.Minimize(total), [columns, rows])
     problem.solve(solver="HIGHS")
     assert problem.status == "optimal"
     return float(problem.value) * scale / n

@@ -66,7 +66,10 @@ def linear_case(
     }
     parts = {"model": model, "sensors": (sensor,), "times": times}
     # The prior is three off, within its standard deviation of five.
-    return (x0 + 3.0, 25.0 * np.eye(6), sensor.observe(truth, rng=rng)), matrices, parts
+    mean = x0 + 3.0
+    cov = 25.0 * np.eye(6)
+    observed = sensor.observe(truth, rng=rng)
+    return (mean, cov, observed), matrices, parts
 
 
 def plain_numpy(mean: Any, cov: Any, y: Any, *, F: Any, H: Any, Q: Any, R: Any) -> Any:
@@ -102,7 +105,8 @@ def plain_numpy(mean: Any, cov: Any, y: Any, *, F: Any, H: Any, Q: Any, R: Any) 
         x = x + (gain @ innovation[..., None])[..., 0]
         factor = np.eye(d) - gain @ h
         # Joseph's form: (I - K H) P (I - K H)ᵀ + K R Kᵀ
-        p = factor @ p @ np.swapaxes(factor, 1, 2) + gain @ r @ np.swapaxes(gain, 1, 2)
+        propagated = factor @ p @ np.swapaxes(factor, 1, 2)
+        p = propagated + gain @ r @ np.swapaxes(gain, 1, 2)
         means[k] = x
         covs[k] = p
     return means, covs
@@ -126,7 +130,8 @@ def run_unscented(
     mean: Any, cov: Any, y: Any, *, model: Any, sensors: Any, times: Any
 ) -> Any:
     f = GaussianFilter(model, sensors, linearization="unscented")
-    states = list(f.steps(f.start((mean, cov), runs=y.shape[1:-1]), times, [y]))
+    start = f.start((mean, cov), runs=y.shape[1:-1])
+    states = list(f.steps(start, times, [y]))
     means = np.array([s.means[:, 0] for s in states])
     return means, np.array([s.covariances[:, 0] for s in states])
 

@@ -19,9 +19,11 @@ PEERS = ((4, 500, 15), (12, 500, 6))
 def mixture(size: int, dim: int, seed: int = 0) -> GaussianMixture:
     """Uneven weights, means in a cloud, full covariances."""
     rng = np.random.default_rng(seed + 1000 * dim + size)
-    roots = 0.4 * rng.standard_normal((size, dim, dim)) + 0.6 * np.eye(dim)
+    deviations = rng.standard_normal((size, dim, dim))
+    roots = 0.4 * deviations + 0.6 * np.eye(dim)
     # R Rᵀ + 0.1 I is positive definite.
-    covs = roots @ np.swapaxes(roots, -1, -2) + 0.1 * np.eye(dim)
+    squares = roots @ np.swapaxes(roots, -1, -2)
+    covs = squares + 0.1 * np.eye(dim)
     w = rng.dirichlet(np.ones(size))
     return GaussianMixture(w, 3 * rng.standard_normal((size, dim)), covs)
 

@@ -71,7 +71,8 @@ def by_particles(package: Any, n: int, seen: np.ndarray) -> np.ndarray:
 def filters() -> Iterator[Row]:
     rng = np.random.default_rng(5)
     truth = simulate(MODEL, np.zeros(3), TIMES, rng=rng)
-    seen = truth @ H.T + rng.standard_normal((STEPS, 2)) @ np.linalg.cholesky(R).T
+    noise = rng.standard_normal((STEPS, 2)) @ np.linalg.cholesky(R).T
+    seen = truth @ H.T + noise
     # The model is linear: the exact means are those of the Kalman filter.
     exact = kalman_filter(np.zeros(3), np.eye(3), seen, F=np.eye(3), H=H, Q=Q, R=R)
     variance = np.diagonal(exact.covariances, axis1=-2, axis2=-1)

@@ -43,7 +43,8 @@ def exact(z: np.ndarray, avoid: np.ndarray) -> np.ndarray:
     # z - Q Qᵀ z has no part along the anomalies to avoid.
     z -= frame @ (frame.mT @ z)
     # Divide by the factor of the sample covariance, which makes it I.
-    root = np.linalg.cholesky(z.mT @ z / (z.shape[-2] - 1))
+    sample_cov = z.mT @ z / (z.shape[-2] - 1)
+    root = np.linalg.cholesky(sample_cov)
     return z @ np.linalg.inv(root).mT
 
 
@@ -59,20 +60,17 @@ def plain_step(
     root = vectors[:, positive] * np.sqrt(values[positive])
     # receives[k, j]: agent k knows its own belief and those of its neighbours.
     receives = np.eye(len(setup.sensors)) + (setup.graph.laplacian.toarray() < 0)
-    received_sensors = [
-        [s for s, row in zip(setup.sensors, rows, strict=True) if row]
-        for rows in receives
-    ]
+    received_sensors = []
+    for row in receives:
+        received_sensors.append([setup.sensors[j] for j in np.flatnonzero(row)])
 
     def predict(k: int, x: np.ndarray, before: np.ndarray) -> np.ndarray:
         """Return the predictions of the sensors that agent k receives, without noise."""
-        return np.concatenate(
-            [
-                s.h(x, before) if s.uses_previous else s.h(x)
-                for s in received_sensors[k]
-            ],
-            axis=-1,
-        )
+        predictions = []
+        for sensor in received_sensors[k]:
+            arguments = (x, before) if sensor.uses_previous else (x,)
+            predictions.append(sensor.h(*arguments))
+        return np.concatenate(predictions, axis=-1)
 
     def draw(avoid: np.ndarray, k: int) -> np.ndarray:
         z = rng.standard_normal((*avoid.shape[:-1], k))
@@ -89,8 +87,10 @@ def plain_step(
             m = h.shape[-1]
             # K = (BᵀB / (N - 1) + I)⁻¹ BᵀA / (N - 1); predictions are in units of the
             # noise
-            gain = np.linalg.solve(b.mT @ b / n + np.eye(m), b.mT @ a / n)
-            x[:, k] -= (h + draw(np.concatenate([a, b], axis=-1), m)) @ gain
+            innovation_cov = b.mT @ b / n + np.eye(m)
+            gain = np.linalg.solve(innovation_cov, b.mT @ a / n)
+            noise = draw(np.concatenate([a, b], axis=-1), m)
+            x[:, k] -= (h + noise) @ gain
         a = anomalies(x)
         covs = a.mT @ a / n
         precise = np.linalg.inv(covs)
@@ -113,10 +113,10 @@ def plain_step(
         # The optimal transport map between the Gaussians before and after
         lower = np.linalg.cholesky(covs)
         values, vectors = np.linalg.eigh(lower.mT @ fused @ lower)
-        turn = np.linalg.solve(
-            lower.mT, (vectors * np.sqrt(values)[..., None, :]) @ vectors.mT
-        )
-        return mean[..., None, :] + a @ (turn @ np.linalg.inv(lower)).mT
+        symmetric_root = (vectors * np.sqrt(values)[..., None, :]) @ vectors.mT
+        turn = np.linalg.solve(lower.mT, symmetric_root)
+        transport = turn @ np.linalg.inv(lower)
+        return mean[..., None, :] + a @ transport.mT
 
     return call
 

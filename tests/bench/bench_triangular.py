@@ -36,9 +36,11 @@ def partly_observed(m: int, d: int) -> tuple[np.ndarray, np.ndarray]:
     """Correlated members of unit scale and noisy observations of them."""
     rng = np.random.default_rng(100 * m + d)
     # A mild correlation, whatever the dimension
-    mixing = np.eye(d) + 0.3 * rng.standard_normal((d, d)) / np.sqrt(d)
+    mixing = np.eye(d)
+    mixing += 0.3 * rng.standard_normal((d, d)) / np.sqrt(d)
     x = rng.standard_normal((SAMPLES, d)) @ mixing
-    return x[:, :m] + 0.5 * rng.standard_normal((SAMPLES, m)), x
+    noise = 0.5 * rng.standard_normal((SAMPLES, m))
+    return x[:, :m] + noise, x
 
 
 @table("triangular", "numpy", "cvxpy", "ecos")
@@ -59,7 +61,8 @@ def programs() -> Iterator[Row]:
 
         compiled_each_time = measure_time(newcomer, 3).cpu
         solved = measure_time(known, 3)
-        gap = np.abs(compose(solved.result, y, x, y[0]) - exact_mean).max()
+        composed = compose(solved.result, y, x, y[0])
+        gap = np.abs(composed - exact_mean).max()
         yield {
             "variables": m + d,
             "closed_form_us": f"{each * 1e6:.1f}",
@@ -148,7 +151,10 @@ class Toolbox:
 
 def error(update: Any, mean: np.ndarray) -> float:
     # Root mean square of the error of the posterior mean, over seeds and components
-    gaps = [update(*bent_samples(seed)).mean(axis=0) - mean for seed in range(SEEDS)]
+    gaps = []
+    for seed in range(SEEDS):
+        analysis = update(*bent_samples(seed))
+        gaps.append(analysis.mean(axis=0) - mean)
     return float(np.sqrt(np.mean(np.square(gaps))))
 
 

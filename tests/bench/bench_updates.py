@@ -89,7 +89,8 @@ def dapper_s_loop(
 
 def ring(x: np.ndarray, t: float) -> np.ndarray:
     """Lorenz's model of 1996: advection, damping and forcing on a circle."""
-    return (np.roll(x, -1, -1) - np.roll(x, 2, -1)) * np.roll(x, 1, -1) - x + 8.0
+    advection = (np.roll(x, -1, -1) - np.roll(x, 2, -1)) * np.roll(x, 1, -1)
+    return advection - x + 8.0
 
 
 def compare_calls(

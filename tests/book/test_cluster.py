@@ -124,7 +124,8 @@ def kill_after(n: int, folder: Path, start: Start, command: str, *victims: Any) 
     for victim in victims or [client]:
         os.killpg(victim.pid, signal.SIGKILL)
     # A killed client leaves a part, and no file that looks complete.
-    assert client.wait(300) != 0 and not (folder / "errors.csv").exists()
+    assert client.wait(300) != 0
+    assert not (folder / "errors.csv").exists()
     hold.unlink()
     return (folder / "output").read_text()
 
@@ -134,7 +135,8 @@ def same(folder: Path, script: Path, twice: int) -> None:
     assert (folder / "errors.csv").read_bytes() == (script / "errors.csv").read_bytes()
     assert not (folder / "errors.csv.part").exists()
     # Every trial ran; only those in flight at a kill may have run again.
-    assert len(start_counts(folder)) == 40 and sum(start_counts(folder)) <= 40 + twice
+    assert len(start_counts(folder)) == 40
+    assert sum(start_counts(folder)) <= 40 + twice
 
 
 def test_on_this_machine_or_in_parts_that_are_merged(
@@ -179,6 +181,7 @@ def test_mpi(folder: Path, script: Path, start: Start) -> None:
     if subprocess.run("mpiexec -n 1 true", shell=True, env=ENVIRONMENT).returncode:
         pytest.skip("mpiexec does not run here")
     (folder / "log" / "fatal").touch()
-    assert start(MPI).wait() != 0 and not (folder / "errors.csv").exists()
+    assert start(MPI).wait() != 0
+    assert not (folder / "errors.csv").exists()
     assert start(MPI).wait() == 0
     same(folder, script, twice=2)

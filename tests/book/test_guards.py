@@ -129,9 +129,9 @@ def shade(cell: Any) -> None:
 def exchange_frames(cell: Any) -> None:
     data = bundle(cell)
     html, frames = extract_pictures(data["text/html"])
-    assert (
-        len(frames) == 4 and frames[0] == frames[2]
-    )  # the first one shown, then all three
+    # The first one shown, then all three
+    assert len(frames) == 4
+    assert frames[0] == frames[2]
     # Equal frames could be exchanged without any difference.
     assert len(set(frames)) == 3
     # Exchange two frames by way of a mark; the text around the frames stays.
@@ -203,7 +203,8 @@ def test_one_changed_output_or_source_fails_and_no_other(
         cells=cells, metadata={"kernelspec": execute.KERNELSPEC}
     )
     result = tool("regress.py", store(folder / "broken.md", notebook))
-    assert result.returncode == 1 and "broken: differs" in result.stdout
+    assert result.returncode == 1
+    assert "broken: differs" in result.stdout
     # pytest prints one block for each cell that differs; text and number alternate.
     parts = re.split(r"^_+ .*Cell (\d+) _+$", result.stderr, flags=re.M)
     messages = dict(zip(map(int, parts[1::2]), parts[2::2], strict=True))
@@ -229,14 +230,11 @@ def test_a_lighter_picture_shows_the_same() -> None:
     # 4 shades of 3 colours make 64.
     few_colours = as_png(noise // 64 * 80)
     many_colours = as_png(noise)
-    assert (
-        len(shrink_picture(few_colours)) < 0.9 * len(few_colours)
-        and difference(shrink_picture(few_colours), few_colours) == ""
-    )
+    assert len(shrink_picture(few_colours)) < 0.9 * len(few_colours)
+    assert difference(shrink_picture(few_colours), few_colours) == ""
     # Shrinking twice is shrinking once, so that stored bytes do not change.
-    assert shrink_picture(many_colours) == many_colours and shrink_picture(
-        shrink_picture(few_colours)
-    ) == shrink_picture(few_colours)
+    assert shrink_picture(many_colours) == many_colours
+    assert shrink_picture(shrink_picture(few_colours)) == shrink_picture(few_colours)
 
 
 def clear(cell: Any) -> None:
@@ -322,20 +320,21 @@ REJECTED = {
 
 
 def test_execution_rejects(execution: Any, executed: Path) -> None:
-    assert execution.returncode == 1 and "failed: a cell failed" in execution.stderr
+    assert execution.returncode == 1
+    assert "failed: a cell failed" in execution.stderr
     # One block for each output that cannot be stored
     cells = re.split(r"^cell [\w-]+:\n", execution.stderr, flags=re.M)[1:]
     for cell, (line, complaint) in zip(cells, REJECTED.items(), strict=True):
-        assert cell.startswith(line) and complaint in cell
+        assert cell.startswith(line)
+        assert complaint in cell
     # Both chapters were executed, and neither was stored.
     unchanged = {
         path.stem
         for path in executed.glob("*.ipynb")
         if path.read_text() == "as it was"
     }
-    assert unchanged == {"rejected", "failed"} and re.findall(
-        r"^\w+", execution.stdout, re.M
-    ) == ["small"]
+    assert unchanged == {"rejected", "failed"}
+    assert re.findall(r"^\w+", execution.stdout, re.M) == ["small"]
 
 
 def test_executing_again_gives_the_same_bytes(
@@ -345,13 +344,11 @@ def test_executing_again_gives_the_same_bytes(
     text = path.read_text(encoding="utf-8")
     # The strictest comparison, of a second execution with the stored bytes
     result = tool("execute.py", "--bytes", executed / "small.md")
-    assert (
-        result.returncode == 0 and result.stderr == "" and "widget-state+json" in text
-    )
-    assert (
-        "version" not in read_notebook(chapter)["metadata"]["language_info"]
-        and str(ROOT) not in text
-    )
+    assert result.returncode == 0
+    assert result.stderr == ""
+    assert "widget-state+json" in text
+    assert "version" not in read_notebook(chapter)["metadata"]["language_info"]
+    assert str(ROOT) not in text
     # A stored digit that is wrong must be found. No second kernel is needed for that.
     path.write_text(text.replace("rate 2.0000", "rate 2.0001"), encoding="utf-8")
     monkeypatch.setattr(

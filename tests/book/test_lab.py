@@ -15,6 +15,7 @@ import nbformat
 import pytest
 from nbformat.sign import NotebookNotary
 
+import execute
 import lab
 from common import BOOK, ROOT, chapters, toc_pages
 
@@ -52,7 +53,8 @@ def test_no_role_is_left_and_no_label_is_lost(working_copy: Path) -> None:
     for source in chapters():
         text = prose(working_copy / "book" / f"{source.stem}.ipynb")
         # JupyterLab shows roles and directives of MyST as raw text.
-        assert not lab.ROLE.search(text) and "{math}" not in text
+        assert not lab.ROLE.search(text)
+        assert "{math}" not in text
         assert "solution-" not in text
         stored = nbformat.read(source.with_suffix(".ipynb"), as_version=4)
         labels = [
@@ -69,6 +71,59 @@ def test_no_role_is_left_and_no_label_is_lost(working_copy: Path) -> None:
         ]
         assert len(re.findall(r"^\*\*Fig\. [\d.]+\*\* ", text, re.M)) == len(figures)
     assert n_labels > 0
+
+
+# A directive, or a role of any name
+RAW = re.compile(r"^[`:]{3,}\{|\{[\w:-]+\}`", re.MULTILINE)
+
+
+@pytest.fixture(scope="module")
+def downloads(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write the notebooks that the pages offer."""
+    folder = tmp_path_factory.mktemp("downloads")
+    lab.write_downloads(folder)
+    return folder
+
+
+def test_a_downloaded_notebook_is_read_alone(downloads: Path) -> None:
+    for source in lab.downloadable():
+        name = f"{source.stem}.ipynb"
+        notebook = nbformat.read(downloads / name, as_version=4)
+        nbformat.validate(notebook)
+        assert "pip install" in notebook.cells[0].source
+        text = prose(downloads / name)
+        assert RAW.findall(text) == []
+        # Other pages are not beside it.
+        assert re.findall(r"\]\(([^)\s]*\.(?:md|ipynb)[^)\s]*)\)", text) == []
+        # Nothing of the page is lost: code, outputs and ids are the stored ones.
+        stored = nbformat.read(source.with_suffix(".ipynb"), as_version=4)
+        cells = {cell.id: cell for cell in notebook.cells}
+        for cell in stored.cells:
+            if cell.cell_type == "code":
+                assert cells[cell.id].source == cell.source
+                assert cells[cell.id].outputs == cell.outputs
+
+
+def run_alone(downloads: Path, source: Path, folder: Path) -> None:
+    """Run a downloaded notebook in an empty folder; an error of a cell raises."""
+    notebook = nbformat.read(downloads / f"{source.stem}.ipynb", as_version=4)
+    execute.run(notebook, folder)
+    # It leaves no file behind either.
+    assert list(folder.iterdir()) == []
+
+
+def test_a_downloaded_notebook_runs_in_an_empty_folder(
+    downloads: Path, tmp_path: Path
+) -> None:
+    run_alone(downloads, lab.downloadable()[0], tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", lab.downloadable()[1:], ids=lambda s: s.stem)
+def test_every_downloaded_notebook_runs_in_an_empty_folder(
+    downloads: Path, tmp_path: Path, source: Path
+) -> None:
+    run_alone(downloads, source, tmp_path)
 
 
 def test_numbers_are_those_of_the_built_book() -> None:
@@ -132,7 +187,8 @@ def test_a_copy_is_kept_and_the_repository_is_not_written_to(
     note = working_copy / "book" / "mine.txt"
     note.write_text("mine")
     assert lab.main([str(working_copy), "--no-open"]) == 0
-    assert note.read_text() == "mine" and "make lab LAB=" in capsys.readouterr().out
+    assert note.read_text() == "mine"
+    assert "make lab LAB=" in capsys.readouterr().out
     note.unlink()
     full = tmp_path / "full"
     full.mkdir()
@@ -232,5 +288,6 @@ def _run_all(address: str, stem: str, scratch: Path) -> None:
             "i.value = Number(i.value) ? 0 : 1; i.dispatchEvent(new Event('input'));"
             "return m.src !== was; })"
         )
-        assert moved and all(moved)
+        assert moved
+        assert all(moved)
         assert driver.execute_async_script(command, "docmanager:save") == "done"

@@ -51,11 +51,13 @@ def test_ledger_has_every_item_once() -> None:
 
 def test_a_verdict_fills_its_row() -> None:
     (row,) = ledger([ITEM], [])
-    assert row["verdict"] == "not yet" and row["chapter"] == ITEM["chapter"]
+    assert row["verdict"] == "not yet"
+    assert row["chapter"] == ITEM["chapter"]
     (row,) = ledger([ITEM], [VERDICT])
     # Cells that the verdict does not give stay empty.
     other_cells = {"kind": "results", "null": "", "control": "", "range": ""}
-    assert row == VERDICT | other_cells and tuple(row) == COLUMNS
+    assert row == VERDICT | other_cells
+    assert tuple(row) == COLUMNS
     assert text_of([row]).splitlines()[1].endswith('"a, b"')
 
 
@@ -94,7 +96,8 @@ def test_a_fitted_result_is_not_counted_as_a_match() -> None:
     # Numbers that our input was chosen to give show nothing about the paper's.
     fitted = {**VERDICT, "verdict": "fitted", "why": "14 numbers fitted to 9"}
     _, counts = summaries(ledger([ITEM], [fitted]))["results"]
-    assert counts["fitted"] == 1 and counts["match"] == counts["differs"] == 0
+    assert counts["fitted"] == 1
+    assert counts["match"] == counts["differs"] == 0
 
 
 def test_claims_have_a_row_each_and_only_the_columns_that_they_need() -> None:
@@ -104,13 +107,15 @@ def test_claims_have_a_row_each_and_only_the_columns_that_they_need() -> None:
     }
     listed = {name: {"claim": f"It is {name}"} for name in ("near", "far")}
     head, _, near, far, end = claims_table(claims_of(row), listed)
-    assert head == "| Claim | Verdict | Ours | If false |" and end == ""
+    assert head == "| Claim | Verdict | Ours | If false |"
+    assert end == ""
     # A bar within a cell must not end it.
     assert near == r"| It is near | fails | error 2 \| 3 m | a coin: 2 |"
     assert far == "| It is far | holds | error 3 | a coin: 9 |"
     with_control = row | {"control": "near, no noise: 0"}
     head, _, near, far, _ = claims_table(claims_of(with_control), listed)
-    assert head.endswith("| If true |") and near.endswith("| no noise: 0 |")
+    assert head.endswith("| If true |")
+    assert near.endswith("| no noise: 0 |")
     assert far.endswith("| – |")
 
 

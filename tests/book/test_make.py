@@ -82,7 +82,8 @@ def test_a_moved_or_copied_folder_makes_its_own(clone: Path, tmp_path: Path) -> 
     # The stamp names the old folder, to which the editable install points.
     copied = tmp_path / "copied"
     shutil.copytree(clone, copied, symlinks=True)
-    assert makes_environment(copied) and not makes_environment(clone)
+    assert makes_environment(copied)
+    assert not makes_environment(clone)
     assert makes_environment(clone.rename(tmp_path / "moved"))
 
 
@@ -92,9 +93,8 @@ def test_an_old_python_or_none_is_named_and_leaves_nothing(
     # A refusal must leave no half environment behind.
     before = sorted(clone.rglob("*"))
     result = make(clone, "environment", "PYTHON=")
-    assert (
-        result.returncode != 0 and "Python 3.11 or newer was not found" in result.stdout
-    )
+    assert result.returncode != 0
+    assert "Python 3.11 or newer was not found" in result.stdout
     monkeypatch.setattr(sys, "version_info", (3, 10, 4))
     monkeypatch.setattr(sys, "argv", ["environment.py", str(clone / ".venv")])
     with pytest.raises(SystemExit, match="Python 3.11 or newer is needed, got 3.10.4"):
@@ -104,19 +104,20 @@ def test_an_old_python_or_none_is_named_and_leaves_nothing(
 
 @pytest.fixture
 def steps(clone: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Record the commands of the tool in order; `fail` as the first makes the second one fail."""
+    """Record the commands of the tool in order; the name in the first entry makes one fail."""
     commands: list[str] = []
 
-    def run(python: str, *arguments: str) -> None:
-        if arguments[1] == "venv":
+    def succeeds(python: str, *arguments: str) -> bool:
+        # "-m venv ..." or "-m pip ...": the module
+        name = arguments[1]
+        if name == "venv":
             pretend(clone, None)
-        commands.append(arguments[1])
-        if len(commands) > 1 and commands[0] == "fail":
-            sys.exit(1)
+        commands.append(name)
+        return commands[0] != f"no {name}"
 
     monkeypatch.chdir(clone)
     # No package is installed in a test.
-    monkeypatch.setattr(environment, "run", run)
+    monkeypatch.setattr(environment, "succeeds", succeeds)
     monkeypatch.setattr(sys, "argv", ["environment.py", ".venv"])
     return commands
 
@@ -125,30 +126,50 @@ def test_the_stamp_comes_last_and_names_the_folder(
     clone: Path, steps: list[str]
 ) -> None:
     environment.main()
-    # The list of packages, the library and the kit: three calls of pip
-    assert steps[0] == "venv" and steps.count("pip") == 3
-    assert (
-        clone / ".venv" / "stamp"
-    ).read_text() == f"{clone}\n" and not makes_environment(clone)
+    # pip installs uv, and uv the list of packages, the library and the kit.
+    assert steps[:5] == ["venv", "pip", "uv", "uv", "uv"]
+    assert (clone / ".venv" / "stamp").read_text() == f"{clone}\n"
+    assert not makes_environment(clone)
     steps.clear()
     # A complete environment is updated in place: files in it stay.
     (clone / ".venv" / "kept").touch()
     environment.main()
-    assert "venv" not in steps and (clone / ".venv" / "kept").exists()
+    assert "venv" not in steps
+    assert (clone / ".venv" / "kept").exists()
+
+
+def test_pip_installs_everything_where_uv_cannot(clone: Path, steps: list[str]) -> None:
+    steps.append("no uv")
+    environment.main()
+    assert steps[1:7] == ["venv", "pip", "uv", "pip", "pip", "pip"]
+    assert (clone / ".venv" / "stamp").exists()
+
+
+def test_uv_is_taken_from_the_lock_with_its_hashes(
+    clone: Path, steps: list[str]
+) -> None:
+    environment.main()
+    text = (clone / ".venv" / "uv.txt").read_text()
+    pin, *hashes = text.replace("\\", "").split()
+    assert pin.startswith("uv==")
+    assert len(hashes) > 5
+    assert all(entry.startswith("--hash=sha256:") for entry in hashes)
 
 
 def test_an_interrupted_update_leaves_no_stamp(clone: Path, steps: list[str]) -> None:
     environment.main()
     # The update breaks at its first command, after the stamp was removed.
-    steps[:] = ["fail"]
+    steps[:] = ["no pip"]
     with pytest.raises(SystemExit):
         environment.main()
-    assert not (clone / ".venv" / "stamp").exists() and makes_environment(clone)
+    assert not (clone / ".venv" / "stamp").exists()
+    assert makes_environment(clone)
     steps.clear()
     (clone / ".venv" / "half").touch()
     environment.main()
     # Without a stamp everything is made again, and the half environment is gone.
-    assert steps[0] == "venv" and not (clone / ".venv" / "half").exists()
+    assert steps[0] == "venv"
+    assert not (clone / ".venv" / "half").exists()
 
 
 def test_line_ends_are_fixed_whatever_a_clone_s_settings_are() -> None:
@@ -176,4 +197,9 @@ def test_the_list_of_packages_is_whole() -> None:
     result = subprocess.run(
         [sys.executable, "-m", "pip", "check"], capture_output=True, text=True
     )
-    assert result.returncode == 0, result.stdout
+    # Left out on purpose: `exclude-dependencies` in pyproject.toml
+    left_out = (
+        r"axe-playwright-python \S+ requires playwright, which is not installed\.\n"
+    )
+    missing = re.sub(left_out, "", result.stdout)
+    assert missing in ("", "No broken requirements found.\n")

@@ -7,7 +7,7 @@ import importlib
 import re
 import runpy
 from pathlib import Path
-from unittest.mock import Mock, call
+from unittest.mock import MagicMock, call
 
 import pytest
 from sphinx.environment.collectors.toctree import TocTreeCollector
@@ -68,12 +68,14 @@ def test_api_pages_are_small_and_document_every_public_name_once() -> None:
     # One page for each part, small enough to load on a phone
     assert max(map(len, texts)) <= 500_000
     text = "".join(texts)
-    assert "TypeAliasForwardRef" not in text and " at 0x" not in text
+    assert "TypeAliasForwardRef" not in text
+    assert " at 0x" not in text
     # A name with two entries would have two addresses.
     anchors = re.findall(r'<dt[^>]* id="(distfilt[^"]*)"', text)
     assert len(anchors) == len(set(anchors))
     public = set(homes().values()) - {*modules(), "distfilt.__version__"}
-    assert len(public) > 50 and public <= set(anchors)
+    assert len(public) > 50
+    assert public <= set(anchors)
 
 
 def test_api_page_is_an_index_and_chapters_and_names_lead_to_each_other() -> None:
@@ -81,15 +83,15 @@ def test_api_page_is_an_index_and_chapters_and_names_lead_to_each_other() -> Non
         'class="api" href="api/updates.html#distfilt.updates',
         "Used in</em> chapter",
     )
-    assert linked in page("book/03-triangular-maps") and used in page(
-        "book/api/updates"
-    )
+    assert linked in page("book/03-triangular-maps")
+    assert used in page("book/api/updates")
     text = page("book/api")
     index = text[text.index("<tbody") : text.index("</tbody>")]
     rows = re.findall(r"<tr.*?</tr>", index, flags=re.DOTALL)
     # One row for each part, the most needed ones first
     assert len(rows) == len(api_parts()) <= 24
-    assert "filters" in plain(rows[0]) and "updates" in plain(rows[1])
+    assert "filters" in plain(rows[0])
+    assert "updates" in plain(rows[1])
     for part, row in zip(api_parts(), rows, strict=True):
         face = importlib.import_module(f"distfilt.{part}")
         assert all(name in plain(row) for name in face.__all__)
@@ -107,7 +109,8 @@ def test_page_of_reproductions_shows_the_ledger() -> None:
         lines[kind] += re.findall(r"<tr.*?</tr>", body, flags=re.DOTALL)
     assert len(lines["Item"]) == len(rows) == 21
     for row, line in zip(rows, lines["Item"], strict=True):
-        assert row["item"] in plain(line) and row["verdict"] in plain(line)
+        assert row["item"] in plain(line)
+        assert row["verdict"] in plain(line)
     # One row a claim, with its own verdict
     claims = [claim for row in rows for claim in claims_of(row)]
     for claim, line in zip(claims, lines["Claim"], strict=True):
@@ -115,7 +118,8 @@ def test_page_of_reproductions_shows_the_ledger() -> None:
     # The sentence above the tables must give the same counts.
     for total, counts in summaries(rows).values():
         counted = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
-        assert f"Of {total} " in plain(text) and counted in plain(text)
+        assert f"Of {total} " in plain(text)
+        assert counted in plain(text)
 
 
 def test_build_stops_at_a_missing_page(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,7 +128,7 @@ def test_build_stops_at_a_missing_page(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         TocTreeCollector, "assign_figure_numbers", None
     )  # which setup changes
-    app = Mock()
+    app = MagicMock()
     conf = runpy.run_path(str(ROOT / "book" / "conf.py"))
     conf["setup"](app)
     assert call("builder-inited", conf["check_toc"]) in app.connect.mock_calls

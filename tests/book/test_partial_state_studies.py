@@ -29,19 +29,20 @@ def test_neighbours_on_an_arc_lie_one_over_the_width_apart(width: float) -> None
     assert np.allclose(chords, 2 * 8.0 * np.sin(angle / 2))
     # The eigenvalues are the variances along and across the sight.
     across = 8.0 * width * angle
-    assert np.allclose(
-        np.sort(np.linalg.eigvalsh(along)),
-        np.sort([NUMBERS["range_std"] ** 2, across**2]),
-    )
-    assert np.isclose(chords[0] / across, np.sinc(angle / 2 / np.pi) / width)
+    variances = np.sort([NUMBERS["range_std"] ** 2, across**2])
+    assert np.allclose(np.linalg.eigvalsh(along), variances)
+    ratio = np.sinc(angle / 2 / np.pi) / width
+    assert np.isclose(chords[0] / across, ratio)
 
 
 def test_ego_errors_are_minus_half_of_those_across() -> None:
     bent = arcs.arc(3, np.array([-8.0, 0.0]), **NUMBERS)
     middle = bent.covs[1]
     # The middle component looks along the first axis: across is the second.
-    assert np.isclose(middle[1, 3], -0.5 * middle[1, 1]) and middle[0, 2] == 0
-    assert np.isclose(middle[3, 3], 0.25 * middle[1, 1] + NUMBERS["ego_std"] ** 2)
+    assert np.isclose(middle[1, 3], -0.5 * middle[1, 1])
+    assert middle[0, 2] == 0
+    ego_variance = NUMBERS["ego_std"] ** 2
+    assert np.isclose(middle[3, 3], 0.25 * middle[1, 1] + ego_variance)
 
 
 def test_only_the_width_changes_in_the_family_of_pairs(
@@ -79,7 +80,8 @@ def test_multiplied_beliefs_add_their_information() -> None:
     J[:6, :6] = np.linalg.inv(other[:6, :6])
     expected = np.linalg.inv(np.linalg.inv(own) + J)
     assert np.allclose(cov, expected, rtol=1e-6, atol=1e-9)
-    assert np.allclose(mean, expected @ J @ np.concatenate([np.ones(6), np.zeros(6)]))
+    ones_then_zeros = np.concatenate([np.ones(6), np.zeros(6)])
+    assert np.allclose(mean, expected @ J @ ones_then_zeros)
 
 
 @pytest.mark.parametrize(("noise", "exact"), [(0.0, True), (0.5, False)])
@@ -98,7 +100,8 @@ def test_increments_are_exact_without_noise_on_the_target(
     increments, joint = (case.run_filters(way, seen) for way in ("increments", "joint"))
     # After the first step nothing ties the agents yet.
     for a, b in zip(increments, joint, strict=True):
-        assert np.allclose(a[0], b[0]) and np.allclose(a, b) == exact
+        assert np.allclose(a[0], b[0])
+        assert np.allclose(a, b) == exact
 
 
 def test_a_lost_message_leaves_the_own_belief() -> None:

@@ -49,7 +49,8 @@ def test_each_prediction_is_brought_near_the_observation_by_itself() -> None:
     assert np.abs(each - 0.2).max() <= np.pi / 2
     # They are the members' angles, up to whole periods.
     turns = (each - angles) / np.pi
-    assert np.allclose(turns, np.round(turns)) and np.ptp(np.round(turns)) == 1
+    assert np.allclose(turns, np.round(turns))
+    assert np.ptp(np.round(turns)) == 1
     # On one branch neighbours stay neighbours.
     together = predictions("together", members, 0.2)
     assert np.allclose(np.diff(together), np.diff(angles))

@@ -14,7 +14,7 @@ from distfilt import filters
 from distfilt.density import Grid
 from distfilt.filters import FilterError, Observation, PolynomialBasis
 from distfilt.mixtures import target_fusion
-from distfilt.models import InputModel, Inputs, LinearModel, Model
+from distfilt.models import AgentModels, InputModel, Inputs, LinearModel, Model
 from distfilt.network import finite_time_consensus, graphs
 from distfilt.sensors import LikelihoodSensor, component
 
@@ -102,6 +102,7 @@ CALLS = {
     "matrix": partial(run_filter, model=DECAY),
     "constant": run_with_constant,
     "input": partial(run_filter, model=DRIVEN),
+    "models": partial(run_filter, model=AgentModels.from_models([DRIVEN, WALK])),
     "likelihood": partial(run_filter, sensor=GAUSSIAN),
     "evidence": partial(run_filter, record_evidence=True),
 }

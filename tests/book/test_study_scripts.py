@@ -47,7 +47,8 @@ def test_make_studies_stores_and_checks(
     assert tool.main(["--workers", "1"], tmp_path) == 0
     path = tmp_path / "data" / "studies" / "zheng" / "spread.csv"
     stored = studies.load(path)
-    assert len(stored) == 12 and stored.parameters == {"members": 20}
+    assert len(stored) == 12
+    assert stored.parameters == {"members": 20}
     assert "trial" in stored.metadata["code"]
     assert tool.main(["spread", "--check", "--workers", "1"], tmp_path) == 0
     assert tool.main(["sprawl"], tmp_path) == 1

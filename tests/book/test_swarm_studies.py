@@ -18,7 +18,8 @@ ROOM = densities.grid()
 def test_histogram_of_the_agents_counts_without_an_error(blocks: int) -> None:
     x = np.random.default_rng(1).random((50, 2))
     errors = densities.count_errors(ROOM, ROOM.histogram(x), x, blocks)
-    assert errors.shape == (1,) and errors[0] < 1e-12
+    assert errors.shape == (1,)
+    assert errors[0] < 1e-12
 
 
 def test_uniform_density_for_agents_in_one_block() -> None:
@@ -96,7 +97,8 @@ def test_amplification_has_the_known_limits() -> None:
         nu, eta = tenfold.consensus(nu, eta, 0 * nu, graph, "paper_explicit")
         sizes.append(np.linalg.norm(nu))
     factor = tenfold.amplification(60.0, "paper")
-    assert factor > 1 and np.isclose(sizes[-1] / sizes[-2], factor, rtol=1e-6)
+    assert factor > 1
+    assert np.isclose(sizes[-1] / sizes[-2], factor, rtol=1e-6)
 
 
 def test_diverged_estimates_stay_as_they_are() -> None:

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from bookkit import studies
-from distfilt import sensors
 from distfilt.filters import GaussianFilter
-from distfilt.models import Model
 from distfilt.network import Channel, graphs
 
 together: Any = studies.script("_together")
@@ -45,6 +43,8 @@ BELIEF = 4 + 10
         ("ekf_flood", 2 * 8, 2 * 7),
         ("ekf_ci", 2 * (1 + BELIEF), 1 + BELIEF),
         ("ekf_naive", 2 * BELIEF, BELIEF),
+        # A mean, and the upper triangles of both parts
+        ("ekf_split", 2 * (4 + 2 * 10), 4 + 2 * 10),
         # An observation, then a mean
         ("ekf_diffuse", 2 * (1 + 4), 1 + 4),
         # Seven links, two messages each; by broadcast the root reaches two at once.
@@ -81,7 +81,8 @@ def test_sums_along_a_tree_are_those_of_all_agents() -> None:
     for graph in (graphs.ring(7), graphs.star(5), graphs.complete(4), graphs.path(3)):
         n = graph.n_agents
         tree = together.spanning_tree(graph)
-        assert len(tree) == n - 1 and len({agent for agent, _ in tree}) == n - 1
+        assert len(tree) == n - 1
+        assert len({agent for agent, _ in tree}) == n - 1
         values = rng.normal(size=(2, n, 3))
         channel = Channel(graph, runs=(2,))
         mean = together.average_on_tree(values, channel)
@@ -90,22 +91,38 @@ def test_sums_along_a_tree_are_those_of_all_agents() -> None:
         assert channel.ledger.scalars.sum() == 2 * (n - 1) * 3
 
 
-def test_the_iterated_update_ends_at_the_posterior_s_mode() -> None:
-    still = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
-    sensor = sensors.distance([0, 1], std=0.2, origin=[4.0, 0.0])
-    cov = np.diag([1.0, 2.0])
-    f = together.IteratedGaussian(still, [sensor], iterations=12)
-    state = f.step(f.start(([1.0, 1.0], cov)), 1.0, [[3.5]])
-    x = state.means[0]
-    # The gradient of the log posterior vanishes there.
-    towards = (x - np.array([4.0, 0.0])) / np.hypot(x[0] - 4.0, x[1])
-    residual = 3.5 - sensor.predict(x)[0]
-    gradient = towards * residual / 0.2**2 - np.linalg.solve(cov, x - 1.0)
-    assert np.abs(gradient).max() < 1e-6
-    # A plain extended update does not end there.
-    once = GaussianFilter(still, [sensor])
-    plain = once.step(once.start(([1.0, 1.0], cov)), 1.0, [[3.5]]).means[0]
-    assert np.abs(plain - x).max() > 0.01
+def test_split_intersection_lies_between_the_own_and_the_joint_filter() -> None:
+    problem = together.problem("linear")
+    _, observations = problem.simulate(3, np.random.default_rng(5))
+    args = problem.model, problem.sensors, problem.graph
+    kalman = GaussianFilter(*args, share_observations=False)
+    split = together.SplitIntersection(*args)
+    first = [values[0] for values in observations]
+    states = []
+    for f in (kalman, split):
+        start = f.start(problem.prior, runs=(3,))
+        states.append(f.step(start, problem.times[0], first))
+    # Fusing reduces the determinant, but no variance falls below the joint filter's.
+    joint = GaussianFilter(problem.model, [problem.all_sensors])
+    start = joint.start(problem.prior, runs=(3,))
+    bound = joint.step(start, problem.times[0], [np.concatenate(first, axis=-1)])
+    log_dets = [np.linalg.slogdet(state.covariances)[1] for state in states]
+    assert (log_dets[1] < log_dets[0] - 0.1).all()
+    excess = states[1].covariances - bound.covariances
+    assert np.linalg.eigvalsh(excess).min() > -1e-9
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_a_failed_run_has_no_error() -> None:
+    """Neither zero nor a number: NaN in every score."""
+    problem = together.problem("lorenz")
+    data = problem.simulate(2, np.random.default_rng(0))
+    data[1][0][3, 1] = 1e200
+    f = together.CELLS["ekf_flood"].make(problem, 1.0)
+    scores = together.score_filter(problem, f, data, None)
+    assert np.isfinite(scores["error"][0])
+    assert np.isnan(scores["error"][1])
+    assert np.isnan(scores["nees"][1])
 
 
 def test_tuning_takes_the_least_error_of_consistent_values() -> None:
@@ -123,22 +140,3 @@ def test_held_out_problems_have_tuned_values_of_their_own() -> None:
         for cell in together.cell_names(name):
             has_row = f"{name}_{cell}" in rows
             assert has_row == bool(together.CELLS[cell].grid)
-
-
-def test_the_iterated_filter_is_the_library_s() -> None:
-    problem = together.problem("range")
-    _, observations = problem.simulate(3, np.random.default_rng(5))
-    options: dict[str, Any] = {"hops": "all", "inflation": 1.1}
-    args = problem.model, problem.sensors, problem.graph
-    ours = together.IteratedGaussian(*args, iterations=4, **options)
-    theirs = GaussianFilter(*args, iterations=4, **options)
-    results = []
-    for f in (ours, theirs):
-        *_, last = f.steps(
-            f.start(problem.prior, runs=(3,)), problem.times, observations
-        )
-        results.append(last)
-    np.testing.assert_allclose(results[0].means, results[1].means, atol=1e-8)
-    np.testing.assert_allclose(
-        results[0].covariances, results[1].covariances, atol=1e-8
-    )

@@ -161,11 +161,16 @@ def test_velocities_become_tangent_and_keep_their_tangent_part() -> None:
     assert np.allclose(momentum(retracted), momentum(x) / radius, atol=1e-12)
     # Other components stay.
     assert (retracted[:, [2, 4]] == x[:, [2, 4]]).all()
+
     # The parabola q_0² + q_1 = 0 has the tangents 2 q_0 v_0 + v_1 = 0.
-    parabola = Constraint(lambda v: v[..., :1] ** 2 + v[..., 1:2], [0.0])
+    def bend(v: np.ndarray) -> np.ndarray:
+        return v[..., :1] ** 2 + v[..., 1:2]
+
+    parabola = Constraint(bend, [0.0])
     retracted = retract(x, parabola, motion=([0, 1], [2, 3]))
     # Its derivative is numerical: 1e-8 in place of rounding.
-    normal_velocity = 2 * retracted[:, 0] * retracted[:, 2] + retracted[:, 3]
+    place, _, speed, climb = retracted[:, :4].T
+    normal_velocity = 2 * place * speed + climb
     assert np.abs(normal_velocity).max() < 1e-8
 
 

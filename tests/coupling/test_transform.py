@@ -198,11 +198,13 @@ def test_with_the_distance_mass_stays_where_it_may(seed: int) -> None:
     x, logs, weights = _case(seed)
     plan = coupling.transport_plans(x, logs, cost="distance")
     staying = np.diagonal(plan)
-    assert np.abs(staying - np.minimum(weights, 1 / 40)).max() < 1e-15
+    most = np.minimum(weights, 1 / 40)
+    assert np.abs(staying - most).max() < 1e-15
     distances = np.sqrt(coupling.squared_distances(x))
     optimal = coupling.transport_plan(distances, weights)
     # The addition that decides ties may cost 1e-7 of the range.
-    assert abs((plan * distances).sum() - optimal.value) < 1e-7 * distances.max()
+    cost = (plan * distances).sum()
+    assert abs(cost - optimal.value) < 1e-7 * distances.max()
     by_square = coupling.transport_plans(x, logs)
     assert (by_square * distances).sum() > 1.01 * optimal.value
     transformed = coupling.transform_ensemble(x, logs, cost="distance")
@@ -232,7 +234,8 @@ def test_the_loss_of_spread_vanishes_for_the_square_only() -> None:
         before = np.trace(_covariance(x, weights))
         for cost in ("squared", "distance"):
             after = coupling.transform_ensemble(x, logs, cost=cost)
-            lost[cost, n] = 1 - np.trace(_covariance(after)) / before
+            left = np.trace(_covariance(after))
+            lost[cost, n] = 1 - left / before
     assert lost["squared", 400] < 0.4 * lost["squared", 50]
     assert lost["distance", 400] > 0.6 * lost["distance", 50]
     assert lost["distance", 400] > 5 * lost["squared", 400]
@@ -261,6 +264,22 @@ def test_entropy_shrinks_the_ensemble_and_debiasing_restores_it() -> None:
     expected = biased + x - unweighted
     expected += weights @ x - expected.mean(axis=0)
     assert np.allclose(debiased, expected)
+
+
+def test_debiasing_takes_off_the_displacement_of_the_same_cost() -> None:
+    """Equal weights then move nothing, whatever the cost."""
+    x, logs, weights = _case(9, 60, 2)
+    options: dict[str, Any] = {"solver": "entropic", "regularisation": 0.05}
+    for cost in ("squared", "distance"):
+        options["cost"] = cost
+        still = coupling.transform_ensemble(x, np.zeros(60), debias=True, **options)
+        assert np.allclose(still, x, rtol=0, atol=1e-12)
+        biased = coupling.transform_ensemble(x, logs, **options)
+        unweighted = coupling.transform_ensemble(x, np.zeros(60), **options)
+        expected = biased + x - unweighted
+        expected += weights @ x - expected.mean(axis=0)
+        debiased = coupling.transform_ensemble(x, logs, debias=True, **options)
+        assert np.allclose(debiased, expected, rtol=0, atol=1e-12)
 
 
 def test_weights_in_place_of_logarithms_warn() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from distfilt import density
 from distfilt.density.snapshot import SwarmSnapshot
 from distfilt.filters import DensityFilter
 from distfilt.models import Swarm, rotating_swarm
-from distfilt.network import Channel, graphs, weights
+from distfilt.network import Channel, Faults, Graph, graphs, weights
 
 GRID = density.Grid((10, 10))
 H = 0.12
@@ -55,6 +57,36 @@ def test_dynamic_average_consensus_mixes_and_adds_the_change_of_the_inputs() -> 
     # Doubly stochastic weights conserve the mean.
     swarm = density.kernel_density(X[1], GRID, bandwidth=H)
     assert np.abs(y.mean(axis=0) - swarm).max() < 1e-12
+
+
+def test_losses_on_one_way_links_move_the_average_and_are_warned_of_once() -> None:
+    """A message that is lost for good: its receiver keeps w of its own value in its place.
+
+    On a circle 0 → 1 → ... → 5 → 0 all weights are 1/2. Without the message from 0 to 1, agent 1
+    keeps its u₁, so that the sum moves by (u₁ - u₀) / 2.
+    """
+    first, _ = _snapshots()
+    circle = Graph.from_edges(6, [((k + 1) % 6, k) for k in range(6)], directed=True)
+    loss = np.zeros((6, 6))
+    loss[1, 0] = 1.0
+    u = first.kernels
+    rule = density.DynamicAverage(modes=None)
+    memory = rule.initial_state(first)
+    with pytest.warns(density.BiasedAverage, match="links both ways, or Flooding"):
+        _, y, _ = rule.update(
+            memory, first, Channel(circle, faults=Faults(loss=loss)), 0.1
+        )
+    assert np.allclose(y.sum(axis=0) - u.sum(axis=0), (u[1] - u[0]) / 2, atol=1e-12)
+    with warnings.catch_warnings(action="error"):
+        # Once for each rule; and never without losses, or with links both ways.
+        rule.update(memory, first, Channel(circle, faults=Faults(loss=loss)), 0.1)
+        other = density.DynamicAverage(modes=None)
+        other.update(memory, first, Channel(circle), 0.1)
+        faults = Faults(loss=0.5, seed=3)
+        _, y, _ = other.update(
+            memory, first, Channel(graphs.ring(6), faults=faults), 0.1
+        )
+    assert np.allclose(y.sum(axis=0), u.sum(axis=0), atol=1e-12)
 
 
 @pytest.mark.parametrize("rate", [True, False])

@@ -144,3 +144,12 @@ def test_a_prior_far_longer_than_the_box_is_its_lowest_modes(
     # In a square two modes share the lowest frequency and the variance 0.5², in a long
     # box one is the lowest.
     assert np.allclose((factor**2).mean(axis=0), expected)
+
+
+def test_interpolation_in_a_box_that_does_not_begin_at_zero() -> None:
+    """A plane is interpolated exactly between the centres of cells of any size."""
+    grid = Grid((4, 5), low=np.array([-2.0, 1.0]), high=np.array([2.0, 3.5]))
+    plane = grid.centres @ [2.0, -3.0] + 0.5
+    positions = np.array([[-1.3, 1.4], [0.2, 2.9], [1.4, 2.2]])
+    expected = positions @ [2.0, -3.0] + 0.5
+    assert np.allclose(grid.interpolate(plane, positions), expected, atol=1e-12)

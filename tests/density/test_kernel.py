@@ -142,3 +142,14 @@ def test_a_cell_is_at_most_two_bandwidths_wide() -> None:
         ValueError, match="^grid must have cells no wider than two bandwidths, 0.08"
     ):
         check_resolution(density.Grid((20, 10)), np.array([0.05, 0.04]))
+
+
+def test_the_constant_of_widths_by_axis_is_a_product() -> None:
+    """∫k² of a Gaussian is Π 1 / (2 √π h_k)."""
+    widths = np.array([[0.2, 0.5]])
+    grid = density.Grid((10, 10))
+    constant = density.kernel_constant(grid, bandwidth=widths, agents=3)
+    assert np.isclose(constant, 1 / (3 * 4 * np.pi * 0.2 * 0.5), rtol=1e-12)
+    equal = density.kernel_constant(grid, bandwidth=[[0.3, 0.3]], agents=3)
+    single = density.kernel_constant(grid, bandwidth=0.3, agents=3)
+    assert np.isclose(equal, single, rtol=1e-12)

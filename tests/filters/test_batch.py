@@ -189,6 +189,22 @@ def check_beliefs(
             assert np.allclose(result, covs[place], atol=1e-9)
 
 
+def make_walk(q: np.ndarray) -> LinearModel:
+    """Return the model with noise of the covariance dt (1 + t) q."""
+    return LinearModel.from_transition(
+        2, model().transition_matrix, lambda t, dt: dt * (1 + t) * q
+    )
+
+
+def list_arrivals(when: float, events: list[Any], agents: int) -> list[list[Any]]:
+    """Return the sensors and observations that arrive at an index of time, by agent."""
+    arrived: list[list[Any]] = [[] for _ in range(agents)]
+    for arrival, sensor, observation in events:
+        if arrival == when:
+            arrived[observation.agent].append((sensor, observation))
+    return arrived
+
+
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None:
@@ -210,9 +226,7 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
     share = family != "mixture" and (family == "news" or rng.random() < 0.8)
     # Without process noise the other families are exact as well.
     q = Q if gaussian or family == "mixture" else 0 * Q
-    walk = LinearModel.from_transition(
-        2, model().transition_matrix, lambda t, dt: dt * (1 + t) * q
-    )
+    walk = make_walk(q)
     nets = {}
     for t, adjacency in zip(times, links, strict=True):
         nets[t] = Graph.from_adjacency(adjacency, directed=True)
@@ -235,10 +249,7 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
     for when in sorted({*range(1, steps + 1), *arrivals}):
         k = int(when)
         t = times[k]
-        now = [[] for _ in team]
-        for arrival, sensor, observation in events:
-            if arrival == when:
-                now[observation.agent].append((sensor, observation))
+        now = list_arrivals(when, events, agents)
         # Observations of earlier times come as delayed ones, those of now by agent.
         seen = [[o for _, o in private if o.t == t] for private in now]
         late = [o for private in now for _, o in private if o.t < t]

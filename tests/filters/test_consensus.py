@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from distfilt.filters import GaussianFilter, InformationConsensusFilter
-from distfilt.models import Model
 from distfilt.network import (
     Channel,
     Faults,
@@ -44,13 +43,15 @@ OPTIONS: dict[str, Any] = {"linearization": "extended"}
 
 def observing(agents: int = 6) -> list[Any]:
     """Sensors of which every agent has one, so that stacking them is simple."""
-    both = Sensor(2, lambda x: x, np.array([[0.5, 0.2], [0.2, 0.4]]), linear=np.eye)
+    cov = np.array([[0.5, 0.2], [0.2, 0.4]])
+    both = Sensor(2, lambda x: x, cov, linear=np.eye)
     kinds = [component([0], std=0.6), both, component([1], std=0.9)]
     return [kinds[k % 3] for k in range(agents)]
 
 
 def last_of(f: Any, seen: Any, runs: tuple[int, ...] = ()) -> Any:
-    *_, last = f.steps(f.start(PRIOR, runs=runs), TIMES, seen)
+    start = f.start(PRIOR, runs=runs)
+    *_, last = f.steps(start, TIMES, seen)
     return last
 
 
@@ -196,7 +197,8 @@ def test_consensus_on_information_is_consistent_for_any_correlation() -> None:
             )
             # Σ_jk K_j C_jk K_kᵀ
             error = np.einsum("iab,ibjc,jdc->ad", gains, blocks, gains)
-            assert np.linalg.eigvalsh(covs[i] - error)[0] > -1e-9 * np.trace(error)
+            smallest = np.linalg.eigvalsh(covs[i] - error)[0]
+            assert smallest > -1e-9 * np.trace(error)
             # Control: the product of the neighbours' densities is not.
             near = [i, *NET.neighbours(i)]
             gains = np.array(
@@ -291,7 +293,8 @@ def test_a_constant_that_all_know_in_consensus_on_measurements() -> None:
         fusion=finite_time_consensus,
         average="measurements",
     )
-    state = f.step(f.start(([0.0, 5.0], np.diag([1.0, 0.0]))), 1.0, [[2.0]] * 6)
+    start = f.start(([0.0, 5.0], np.diag([1.0, 0.0])))
+    state = f.step(start, 1.0, [[2.0]] * 6)
     # Six observations of 2 and a prior of 0 with equal weights
     assert np.allclose(state.means, [12 / 7, 5.0])
     assert np.allclose(state.covariances[:, 0, 0], 1 / 7)
@@ -308,7 +311,14 @@ def test_without_links_agents_filter_alone() -> None:
 @pytest.mark.parametrize("linearization", ["extended", "unscented"])
 def test_angles_and_nonlinear_sensors(linearization: Any) -> None:
     """As Kalman filters that flood their bearings, as long as their means are equal."""
-    places = [[-2.0, 0.0], [0.0, -2.0], [2.0, 0.0], [0.0, 2.0], [2.0, 2.0], [-2.0, 2.0]]
+    places = [
+        [-2.0, 0.0],
+        [0.0, -2.0],
+        [2.0, 0.0],
+        [0.0, 2.0],
+        [2.0, 2.0],
+        [-2.0, 2.0],
+    ]
     sensors = [bearing([0, 1], std=0.05, origin=p) for p in places]
     options: dict[str, Any] = {"linearization": linearization}
     f = InformationConsensusFilter(
@@ -332,7 +342,8 @@ def test_runs_of_a_batch_lose_their_own_messages() -> None:
     state = last_of(f, seen, (8,))
     assert np.isfinite(state.means).all()
     # Lost messages change every run, and spoil none.
-    difference = np.abs(state.means - last_of(exact, seen, (8,)).means).max(axis=(1, 2))
+    expected = last_of(exact, seen, (8,))
+    difference = np.abs(state.means - expected.means).max(axis=(1, 2))
     assert (difference > 1e-6).all()
     assert (np.linalg.eigvalsh(state.covariances) > 0).all()
 
@@ -360,7 +371,7 @@ def test_what_is_refused() -> None:
 
 
 def test_a_known_constant_is_refused_where_all_information_is_averaged() -> None:
-    rest = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
+    rest = still_model(2)
     prior = (np.zeros(2), np.diag([1.0, 0.0]))
     sensors = [component([0], std=1.0)] * 2
     options: dict[str, Any] = {"fusion": finite_time_consensus}

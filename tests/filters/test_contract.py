@@ -307,7 +307,8 @@ def test_a_late_reading_belongs_to_its_own_time(
     between = origin + 2.4 * dt
     after = f.step(state, now, [None], delayed=late(between))
     variances = [f.summarize(then).variance.mean() for then in after.lagged_states]
-    assert after.times[np.argmin(variances)] == between and len(after.times) == 3
+    assert after.times[np.argmin(variances)] == between
+    assert len(after.times) == 3
     # A run that stepped to that time has the same, up to the sampling error of the 20 runs.
     stepped = f.start(prior, rng=default_rng(1), runs=(20,), t=origin)
     for t in (*times[1:3], between, times[3]):

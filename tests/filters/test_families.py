@@ -58,7 +58,8 @@ def test_network_of_exact_ensembles_is_the_network_of_kalman_filters(lag: int) -
     # The Gaussian network starts from the sample moments of the members.
     e = start.ensembles
     mean = e.mean(axis=-2)
-    cov = np.array([[np.cov(m.T) for m in agents] for agents in e])
+    anomalies = e - mean[..., None, :]
+    cov = anomalies.mT @ anomalies / (e.shape[-2] - 1)
     state = filters.GaussianState(0.0, begin.ledger, None, mean, cov, 2)
     late = []
     if lag:

@@ -30,7 +30,9 @@ each_network = pytest.mark.parametrize("graph", NETWORKS.values(), ids=NETWORKS.
 
 def team(agents: int = 6) -> list[Any]:
     """Sensors of one number, the last agent without one."""
-    sensors: list[Any] = [component([k % 2], std=0.5 + 0.1 * k) for k in range(agents)]
+    sensors: list[Any] = []
+    for k in range(agents):
+        sensors.append(component([k % 2], std=0.5 + 0.1 * k))
     return [*sensors[:-1], None]
 
 
@@ -87,7 +89,8 @@ def test_a_ring_costs_half_of_an_echo(agents: int) -> None:
         graphs.ring(agents),
         hops="all",
     )
-    ledger = f.step(f.start(([0.0], [[1.0]])), 0.0, [[1.0]] * agents).ledger
+    start = f.start(([0.0], [[1.0]]))
+    ledger = f.step(start, 0.0, [[1.0]] * agents).ledger
     # The farthest agents of an odd ring have it from one side, and send it to each other.
     assert (ledger.scalars == 2 * (agents + agents % 2)).all()
     # By broadcast each observation is sent once, unless all neighbours have it.
@@ -98,7 +101,8 @@ def test_a_ring_costs_half_of_an_echo(agents: int) -> None:
 def test_each_agent_forwards_an_observation_once(graph: Graph) -> None:
     """To all neighbours but those that are one link nearer to the agent that made it."""
     f = GaussianFilter(still_model(1), [component([0], std=1.0)] * 6, graph, hops="all")
-    ledger = f.step(f.start(([0.0], [[1.0]])), 0.0, [[1.0]] * 6).ledger
+    start = f.start(([0.0], [[1.0]]))
+    ledger = f.step(start, 0.0, [[1.0]] * 6).ledger
     for agent in range(6):
         count = 0
         for maker in range(6):
@@ -112,7 +116,8 @@ def test_each_agent_forwards_an_observation_once(graph: Graph) -> None:
 @pytest.mark.parametrize("graph", [NETWORKS["path"], NETWORKS["star"]])
 def test_on_a_tree_an_observation_crosses_every_link_once(graph: Graph) -> None:
     f = GaussianFilter(still_model(1), [component([0], std=1.0)] * 6, graph, hops="all")
-    ledger = f.step(f.start(([0.0], [[1.0]])), 0.0, [[1.0]] * 6).ledger
+    start = f.start(([0.0], [[1.0]]))
+    ledger = f.step(start, 0.0, [[1.0]] * 6).ledger
     assert ledger.scalars.sum() == 6 * 5 * 2
 
 
@@ -123,7 +128,8 @@ def test_lost_messages_run_by_run() -> None:
     faults = Faults(loss=0.3, seed=4)
     f = GaussianFilter(still_model(1), sensors, graph, hops="all", faults=faults)
     values = default_rng(0).standard_normal((6, 40, 1))
-    state = f.step(f.start(([0.0], [[1.0]]), runs=(40,)), 1.0, list(values))
+    start = f.start(([0.0], [[1.0]]), runs=(40,))
+    state = f.step(start, 1.0, list(values))
     # 1 / P = 1 + number of observations, in each run
     count = 1 / state.covariances[..., 0, 0] - 1
     # From its own plan of losses, by hand.
@@ -136,7 +142,8 @@ def test_lost_messages_run_by_run() -> None:
         received = np.zeros_like(fresh)
         for link, (i, j) in enumerate(zip(graph.receivers, graph.senders, strict=True)):
             # Fresh at j, not from i, and not lost
-            sent = fresh[:, j] & ~sources[:, j, i] & ~lost[:, link, None]
+            is_new = fresh[:, j] & ~sources[:, j, i]
+            sent = is_new & ~lost[:, link, None]
             sources[:, i, j] |= sent
             received[:, i] |= sent
         fresh = received & ~expected
@@ -154,7 +161,8 @@ def test_delayed_and_several_observations_are_flooded_too() -> None:
     states = []
     for network, hops in ((graph, "all"), (graphs.complete(4), 1)):
         f = GaussianFilter(still_model(1, 0.3), sensors, network, hops=hops, **options)
-        *_, last = f.steps(f.start(([0.0], [[1.0]])), [0.3, 0.6, 0.9, 1.2], seen)
+        start = f.start(([0.0], [[1.0]]))
+        *_, last = f.steps(start, [0.3, 0.6, 0.9, 1.2], seen)
         states.append(last)
     assert np.array_equal(states[0].joint_means, states[1].joint_means)
     # All agents have all observations, assimilated in another order.

@@ -42,7 +42,8 @@ WIDE = LinearModel.from_transition(
 
 
 def last_of(f: Any, prior: Any, seen: Any, runs: tuple[int, ...] = ()) -> Any:
-    *_, last = f.steps(f.start(prior, runs=runs), TIMES, seen)
+    start = f.start(prior, runs=runs)
+    *_, last = f.steps(start, TIMES, seen)
     return last
 
 
@@ -93,11 +94,14 @@ def test_two_peaks_by_quadrature() -> None:
         grid=LINE,
         record_evidence=True,
     )
-    state = f.step(f.start(([0.3], [[1.0]])), 0.0, [[1.0]])
+    start = f.start(([0.3], [[1.0]]))
+    state = f.step(start, 0.0, [[1.0]])
     summary = f.summarize(state)
     assert abs(summary.mean.item() - mean) < 1e-6
     assert abs(summary.variance.item() - variance) < 1e-6
-    evidence = np.trapezoid(norm(0.3, 1.0).pdf(x) * norm(x**2, 0.2).pdf(1.0), x)
+    prior = norm(0.3, 1.0).pdf(x)
+    likelihood = norm(x**2, 0.2).pdf(1.0)
+    evidence = np.trapezoid(prior * likelihood, x)
     assert abs(state.log_likelihood.item() - np.log(evidence)) < 1e-6
 
 
@@ -108,10 +112,12 @@ def test_a_nonlinear_transition_by_its_integral() -> None:
         return x + 2.0 * np.sin(x) * dt + t
 
     f = GridFilter(Model(1, bend, lambda t, dt: 0.1 * np.eye(1)), [None], grid=LINE)
-    state = f.step(f.start(([0.3], [[1.0]]), t=0.5), 1.0, [None])
+    start = f.start(([0.3], [[1.0]]), t=0.5)
+    state = f.step(start, 1.0, [None])
     z = np.linspace(-8.0, 8.0, 4001)
     # The density at the centres, times the volume of a cell
-    p = norm(bend(z, 0.5, 0.5), np.sqrt(0.1)).pdf(LINE.centres) * norm(0.3, 1.0).pdf(z)
+    transition = norm(bend(z, 0.5, 0.5), np.sqrt(0.1)).pdf(LINE.centres)
+    p = transition * norm(0.3, 1.0).pdf(z)
     expected = np.trapezoid(p, z, axis=1) * LINE.volume
     assert np.allclose(state.masses[0], expected, atol=1e-8)
 
@@ -223,7 +229,8 @@ def test_runs_gates_losses_and_files(tmp_path: Any) -> None:
     # One observation of one run is far off.
     rejected = np.zeros((3, 5))
     for k, t in enumerate(TIMES):
-        state = f.step(state, float(t), [None if y is None else y[k] for y in seen])
+        observed = [None if y is None else y[k] for y in seen]
+        state = f.step(state, float(t), observed)
         rejected += state.rejected
     assert (rejected[1, 0] > 0).all()
     assert rejected[[0, 2]].sum() <= 2
@@ -262,10 +269,12 @@ def test_counts_as_a_likelihood() -> None:
 
     sensor = LikelihoodSensor(1, log_density)
     f = GridFilter(still_model(1), [sensor], grid=LINE)
-    state = f.step(f.start(([0.0], [[1.0]])), 0.0, [[3.0]])
+    start = f.start(([0.0], [[1.0]]))
+    state = f.step(start, 0.0, [[3.0]])
     x = LINE.centres[:, 0]
     # Poisson likelihood times the normal prior
-    expected = np.exp(3 * x - np.exp(x) - 0.5 * x**2)
+    log_likelihood = 3 * x - np.exp(x)
+    expected = np.exp(log_likelihood - 0.5 * x**2)
     assert np.allclose(state.masses[0], expected / expected.sum(), atol=1e-12)
 
 

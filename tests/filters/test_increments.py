@@ -286,7 +286,8 @@ def test_a_target_that_moves_with_noise_needs_readings_in_place_of_news(
     all_ = Model(3, lambda x, t, dt: x, lambda t, dt: noise)
     eyes = []
     for row in h:
-        eyes.append(Sensor(1, lambda x, row=row: x @ row[:, None], [[0.3]]))
+        column = row[:, None]
+        eyes.append(Sensor(1, lambda x, column=column: x @ column, [[0.3]]))
     shared = GaussianFilter(all_, eyes, path)
     joint = shared.start((mean, cov))
     for k, y in enumerate(readings, start=1):

@@ -14,27 +14,36 @@ from distfilt.network import graphs
 from distfilt.sensors import Sensor, bearing, distance
 from tests.filters.families import PRIOR, TIMES, data, model, still_model, team
 
-CUBE = Sensor(1, lambda x: x**3, [[0.04]], derivative=lambda x: 3 * x[..., None] ** 2)
+CUBE = Sensor(
+    1,
+    lambda x: x**3,
+    [[0.04]],
+    derivative=lambda x: 3 * x[..., None] ** 2,
+)
 
 
 def test_the_limit_is_the_maximum_of_the_posterior() -> None:
     """Minus log density (x - 1)² / 2 + (y - x³)² / 0.08, and its curvature by Gauss-Newton."""
     # Enough steps of Gauss and Newton to converge
     f = GaussianFilter(still_model(1), [CUBE], iterations=30)
-    state = f.step(f.start(([1.0], [[1.0]])), 0.0, [[5.0]])
+    start = f.start(([1.0], [[1.0]]))
+    state = f.step(start, 0.0, [[5.0]])
 
     def cost(x: np.ndarray) -> float:
-        return float((x[0] - 1) ** 2 / 2 + (5 - x[0] ** 3) ** 2 / 0.08)
+        prior = (x[0] - 1) ** 2 / 2
+        misfit = (5 - x[0] ** 3) ** 2 / 0.08
+        return float(prior + misfit)
 
     best = minimize(cost, [1.5], tol=1e-12).x[0]
     assert abs(state.means.item() - best) < 1e-6
     # 1 + H² / R with the slope there
-    assert np.isclose(
-        1 / state.covariances.item(), 1 + (3 * best**2) ** 2 / 0.04, rtol=1e-4
-    )
+    slope = 3 * best**2
+    information = 1 + slope**2 / 0.04
+    assert np.isclose(1 / state.covariances.item(), information, rtol=1e-4)
     # Control: one linearisation, about the forecast, is far from it.
     g = GaussianFilter(still_model(1), [CUBE])
-    once = g.step(g.start(([1.0], [[1.0]])), 0.0, [[5.0]])
+    start = g.start(([1.0], [[1.0]]))
+    once = g.step(start, 0.0, [[5.0]])
     assert abs(once.means.item() - best) > 0.5
 
 
@@ -44,7 +53,8 @@ def test_linear_sensors_need_no_iterations(iterations: int) -> None:
     last = []
     for options in ({}, {"iterations": iterations}):
         f = GaussianFilter(model(), team(), graphs.path(5), lag=1, **options)
-        *_, state = f.steps(f.start(PRIOR, runs=(2,)), TIMES, seen)
+        start = f.start(PRIOR, runs=(2,))
+        *_, state = f.steps(start, TIMES, seen)
         last.append(state)
     assert (last[0].joint_means == last[1].joint_means).all()
     assert (last[0].joint_covariances == last[1].joint_covariances).all()
@@ -84,16 +94,19 @@ def _update(
     m, p = prior
     # Present components only: rows of H and blocks of R
     h = sensor.jacobian(x)[present]
-    r = sensor.residual(y, sensor.predict(x))[present] - h @ (m - x)
+    residual = sensor.residual(y, sensor.predict(x))[present]
+    r = residual - h @ (m - x)
     noise = sensor.noise_cov[np.ix_(present, present)]
-    gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + noise)
+    innovation_cov = h @ p @ h.T + noise
+    gain = p @ h.T @ np.linalg.inv(innovation_cov)
     return m + gain @ r, p - gain @ h @ p
 
 
 def test_the_past_follows_the_iterated_present() -> None:
     """By its regression on it: the same as for a linear sensor of the same result."""
     f = GaussianFilter(still_model(1, 0.5), [CUBE], lag=1, iterations=20)
-    state = f.step(f.start(([1.0], [[1.0]])), 1.0, [[5.0]])
+    start = f.start(([1.0], [[1.0]]))
+    state = f.step(start, 1.0, [[5.0]])
     # Before: the past is N(1, 1), the present N(1, 1.5), and their covariance 1.
     shift = (state.means - 1.0).item()
     past = state.lagged_states[0]
@@ -107,7 +120,8 @@ def test_a_batch_is_each_run_alone_whatever_the_others_see() -> None:
     with np.errstate(all="ignore"):
         batch = f.step(f.start(([1.0], [[1.0]]), runs=(3,)), 0.0, [values])
     assert not batch.failed[[0, 2]].any()
-    alone = f.step(f.start(([1.0], [[1.0]])), 0.0, [[3.0]])
+    start = f.start(([1.0], [[1.0]]))
+    alone = f.step(start, 0.0, [[3.0]])
     assert np.allclose(batch.means[2], alone.means)
 
 
@@ -116,9 +130,11 @@ def test_where_a_later_point_cannot_see() -> None:
     root = Sensor(1, lambda x: np.where(x > 0, x**2, np.nan), [[1e-4]])
     f = GaussianFilter(still_model(1), [root], iterations=3)
     # The first step leads to a negative state, from where nothing can be seen.
-    state = f.step(f.start(([1.0], [[9.0]])), 0.0, [[-4.0]])
+    start = f.start(([1.0], [[9.0]]))
+    state = f.step(start, 0.0, [[-4.0]])
     g = GaussianFilter(still_model(1), [root])
-    once = g.step(g.start(([1.0], [[9.0]])), 0.0, [[-4.0]])
+    start = g.start(([1.0], [[9.0]]))
+    once = g.step(start, 0.0, [[-4.0]])
     assert once.means.item() < 0
     assert np.allclose(state.means, once.means)
 

@@ -70,7 +70,8 @@ def test_few_rounds_are_close_and_more_are_closer() -> None:
     for rounds in (1, 10, 80):
         rule = partial(average_consensus, rounds=rounds)
         f = make(LikelihoodConsensusFilter, fusion=rule, members=3000)
-        errors.append(np.abs(f.summarize(last_of(f, seen)).mean - expected).max())
+        summary = f.summarize(last_of(f, seen))
+        errors.append(np.abs(summary.mean - expected).max())
     assert errors[0] > 2 * errors[2]
     assert errors[2] < 0.15
 
@@ -174,7 +175,8 @@ def test_gate_losses_runs_and_failures() -> None:
     state = f.start(PRIOR, rng=default_rng(3), runs=(3,))
     rejected = 0.0
     for k, t in enumerate(TIMES):
-        state = f.step(state, float(t), [None if y is None else y[k] for y in seen])
+        observed = [None if y is None else y[k] for y in seen]
+        state = f.step(state, float(t), observed)
         rejected += state.rejected
     assert rejected[1, 0] >= 1
     assert np.isfinite(f.summarize(state).mean).all()

@@ -463,7 +463,8 @@ def test_a_prior_of_any_kind() -> None:
     # A known constant has no variance; on a linear model sigma points and derivatives agree.
     ends = []
     for g in (filters.GaussianFilter(model(), EYES, NET), unscented):
-        state = g.step(g.start(flat), 0.0, [[1.0], [1.0, 2.0], [0.5]])
+        start = g.start(flat)
+        state = g.step(start, 0.0, [[1.0], [1.0, 2.0], [0.5]])
         assert np.allclose(state.means[:, 1], PRIOR[0][1])
         ends.append(g.step(state, 0.5, [[0.5], [1.0, 2.0], [0.5]]))
     assert np.allclose(ends[0].means, ends[1].means)

@@ -9,7 +9,12 @@ import pytest
 from numpy.random import default_rng
 from scipy.stats import norm
 
-from distfilt.filters import GaussianFilter, GaussianSumFilter, MixtureFilter
+from distfilt.filters import (
+    GaussianFilter,
+    GaussianSumFilter,
+    MixtureFilter,
+    Observation,
+)
 from distfilt.mixtures import GaussianMixture, split_gaussian
 from distfilt.models import Model
 from distfilt.network import Faults, graphs
@@ -31,7 +36,8 @@ def mixture(seed: int = 1, components: int = 4, d: int = 2) -> GaussianMixture:
 
 
 def last_of(f: Any, prior: Any, seen: Any, runs: tuple[int, ...] = ()) -> Any:
-    *_, last = f.steps(f.start(prior, runs=runs), TIMES, seen)
+    start = f.start(prior, runs=runs)
+    *_, last = f.steps(start, TIMES, seen)
     return last
 
 
@@ -68,7 +74,8 @@ def test_a_split_of_some_components_keeps_full_moments(axes: Any) -> None:
     # The other components follow by regression: their conditional law is kept.
     first = [0, 1, 2] if axes is None else axes
     rest = [k for k in range(3) if k not in first]
-    gain = cov[np.ix_(rest, first)] @ np.linalg.inv(cov[np.ix_(first, first)])
+    cross = cov[np.ix_(rest, first)]
+    gain = cross @ np.linalg.inv(cov[np.ix_(first, first)])
     piece = split.covs[0]
     inner = np.linalg.inv(piece[np.ix_(first, first)])
     assert np.allclose(piece[np.ix_(rest, first)] @ inner, gain)
@@ -138,10 +145,12 @@ def test_the_evidence_is_the_density_of_the_mixture() -> None:
     state = f.step(f.start(prior), 1.0, [[0.7]])
     # Σ w_l N(y; m_l, P_l + R)
     std = np.sqrt(prior.covs[:, 0, 0] + 0.25)
-    density = (prior.weights * norm(prior.means[:, 0], std).pdf(0.7)).sum()
+    densities = norm(prior.means[:, 0], std).pdf(0.7)
+    density = (prior.weights * densities).sum()
     assert np.allclose(state.log_likelihood, np.log(density))
     mean, cov = prior.moments()
-    assert np.allclose(state.nis, (0.7 - mean) ** 2 / (cov[0, 0] + 0.25))
+    expected_nis = (0.7 - mean) ** 2 / (cov[0, 0] + 0.25)
+    assert np.allclose(state.nis, expected_nis)
 
 
 # Against Bayes' rule.
@@ -149,10 +158,16 @@ def test_the_evidence_is_the_density_of_the_mixture() -> None:
 
 def test_two_peaks_by_quadrature() -> None:
     """A square is observed: the belief has two peaks, which a Kalman filter cannot have."""
-    sensor = Sensor(1, lambda x: x**2, [[0.04]], derivative=lambda x: 2 * x[..., None])
+    sensor = Sensor(
+        1,
+        lambda x: x**2,
+        [[0.04]],
+        derivative=lambda x: 2 * x[..., None],
+    )
     x = np.linspace(-5.0, 5.0, 20001)
     # Prior times likelihood, on a fine grid
-    posterior = norm(0.3, 1.0).pdf(x) * norm(x**2, 0.2).pdf(1.0)
+    density = norm(0.3, 1.0).pdf(x)
+    posterior = density * norm(x**2, 0.2).pdf(1.0)
     posterior /= np.trapezoid(posterior, x)
     mean = np.trapezoid(posterior * x, x)
     variance = np.trapezoid(posterior * (x - mean) ** 2, x)
@@ -163,7 +178,8 @@ def test_two_peaks_by_quadrature() -> None:
     assert abs(state.covariances.item() - variance) < 0.03
     # Control: one component takes the side on which its mean is.
     g = GaussianFilter(still_model(1), [sensor])
-    one = g.step(g.start(([0.3], [[1.0]])), 0.0, [[1.0]])
+    start = g.start(([0.3], [[1.0]]))
+    one = g.step(start, 0.0, [[1.0]])
     assert abs(one.means.item() - mean) > 0.3
 
 
@@ -174,8 +190,6 @@ def test_a_bearing_behind_the_cut_and_two_distances() -> None:
         [0.5, 0.5], [[-1.0, 0.1], [-1.0, -0.1]], [0.01 * np.eye(2)] * 2
     )
     f = GaussianSumFilter(still_model(2), [[eye, distance([0, 1], std=0.1)]])
-    from distfilt.filters import Observation
-
     seen = [[Observation(0.0, 0, [3.12]), Observation(0.0, 0, [1.0], 1)]]
     state = f.step(f.start(prior), 0.0, seen)
     shifts = np.abs(state.component_means[0] - prior.means)
@@ -201,6 +215,24 @@ def test_a_component_that_cannot_see_loses_its_weight() -> None:
     assert state.unseen.tolist() == [1.0]
 
 
+def test_what_no_component_can_see_leaves_the_belief_as_it_was() -> None:
+    """Unequal weights stay, the evidence is that of the other sensor alone."""
+    sees = component([0], std=0.5)
+    blind = Sensor(1, lambda x: np.full_like(x, np.nan), [[0.01]])
+    prior = mixture(d=1)
+    options: dict[str, Any] = {"record_evidence": True}
+    alone = GaussianSumFilter(still_model(1), [sees], **options)
+    both = GaussianSumFilter(still_model(1), [[sees, blind]], **options)
+    expected = alone.step(alone.start(prior), 1.0, [[0.7]])
+    observed = [Observation(1.0, 0, [0.7], 0), Observation(1.0, 0, [2.0], 1)]
+    with pytest.warns(RuntimeWarning, match="no component can see"):
+        state = both.step(both.start(prior), 1.0, [observed])
+    assert np.ptp(expected.weights) > 0.1
+    assert np.allclose(state.weights, expected.weights, rtol=1e-12)
+    assert np.allclose(state.component_means, expected.component_means, rtol=1e-12)
+    assert np.allclose(state.log_likelihood, expected.log_likelihood, rtol=1e-12)
+
+
 # The contract.
 
 
@@ -214,7 +246,8 @@ def test_runs_failures_and_files(tmp_path: Any) -> None:
     with np.errstate(all="ignore"):
         state = last_of(f, mixture(), bad, (3,))
     assert state.failed.tolist() == [False, True, False]
-    alone = last_of(f, mixture(), [None if y is None else y[:, 2] for y in seen])
+    of_run = [None if y is None else y[:, 2] for y in seen]
+    alone = last_of(f, mixture(), of_run)
     assert np.allclose(state.means[2], alone.means, rtol=0, atol=1e-12)
     state.save(tmp_path / "state.npz")
     loaded = f.state_class.load(tmp_path / "state.npz")
@@ -234,7 +267,8 @@ def test_noise_that_depends_on_time_and_state_reaches_all_components() -> None:
     state = f.step(f.start(prior, t=1.0), 1.5, [None])
     for k in range(prior.n_components):
         g = GaussianFilter(wave, [None])
-        one = g.step(g.start((prior.means[k], prior.covs[k]), t=1.0), 1.5, [None])
+        start = g.start((prior.means[k], prior.covs[k]), t=1.0)
+        one = g.step(start, 1.5, [None])
         assert np.allclose(state.component_means[0, k], one.means[0])
         assert np.allclose(state.component_covariances[0, k], one.covariances[0])
     assert np.allclose(state.weights[0], prior.weights)

@@ -28,7 +28,9 @@ def rotation(noise: float = 0.0) -> LinearModel:
     """A turning state, without process noise by default."""
 
     def transition(dt: float) -> np.ndarray:
-        return np.array([[np.cos(dt), np.sin(dt)], [-np.sin(dt), np.cos(dt)]])
+        c = np.cos(dt)
+        s = np.sin(dt)
+        return np.array([[c, s], [-s, c]])
 
     return LinearModel.from_transition(2, transition, lambda t, dt: noise * np.eye(2))
 
@@ -68,7 +70,8 @@ def central(seen: list[np.ndarray], quiet: int) -> tuple[np.ndarray, np.ndarray]
         start = stop
     y = np.concatenate(seen, axis=-1)
     # In the quiet steps all components are missing.
-    y = np.concatenate([y, np.full((quiet, *y.shape[1:]), np.nan)])
+    nothing = np.full((quiet, *y.shape[1:]), np.nan)
+    y = np.concatenate([y, nothing])
     result = kalman_filter(
         *PRIOR,
         y,
@@ -95,14 +98,16 @@ def test_all_agents_become_the_central_filter(tree: Graph) -> None:
         rotation(), sensors(), tree, share_observations=False, fusion=naive_fusion
     )
     wrong = run(naive, seen, tree.diameter)
-    assert (np.trace(wrong.covariances, axis1=1, axis2=2) < 0.5 * np.trace(cov)).all()
+    wrong_traces = np.trace(wrong.covariances, axis1=1, axis2=2)
+    assert (wrong_traces < 0.5 * np.trace(cov)).all()
 
 
 @each_tree
 def test_information_travels_one_link_a_step(tree: Graph) -> None:
     """One observation each; after k steps an agent has those of k links away."""
     f = ChannelFilter(still_model(1), [component([0], std=1.0)] * 5, tree)
-    state = f.step(f.start(([0.0], [[1.0]])), 1.0, [[1.0]] * 5)
+    start = f.start(([0.0], [[1.0]]))
+    state = f.step(start, 1.0, [[1.0]] * 5)
     for k in range(1, 5):
         # 1 / P = 1 + number of observations
         count = 1 / state.covariances.ravel() - 1

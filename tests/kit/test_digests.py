@@ -72,9 +72,8 @@ def test_digest_text():
     )
     assert digest(a=[np.nan, np.nan]) == "a: 2 values, 2 NaN"
     text = digest(a=[1.0, np.nan, np.inf, 2.0])
-    assert text.endswith("1 NaN, 1 infinite") and text.startswith(
-        "a: 4 values, 1..2, mean 1.5,"
-    )
+    assert text.endswith("1 NaN, 1 infinite")
+    assert text.startswith("a: 4 values, 1..2, mean 1.5,")
     assert digest(a=[np.nan, 1.0, np.inf, 2.0]) != text
     # The mean of a full period is 0 up to rounding.
     assert "mean 0," in digest(a=np.sin(np.linspace(0, 2 * np.pi, 101)[:-1]))
@@ -152,7 +151,8 @@ def test_one_changed_artist_changes_the_text():
     # Every changed artist must give a text of its own.
     changes = ["", *CHANGED, "swapped panels", "hidden curve", "missing points"]
     texts = [of_axes(picture(change)) for change in changes]
-    assert len(set(texts)) == len(changes) and texts[0] == of_axes(picture())
+    assert len(set(texts)) == len(changes)
+    assert texts[0] == of_axes(picture())
 
 
 def test_drawing_and_style_do_not_change_the_text(tmp_path):
@@ -176,14 +176,14 @@ def test_text_of_each_kind():
     lines = of_axes(axes).splitlines()
     assert lines[0] == "axes 1: 2 lines, 2 patches, 1 image"
     assert lines[1].startswith("line 1 x: 2 values, 0..1, mean 0.5,")
-    assert lines[2].startswith("line 1 y: 2 values, 2..2,") and lines[2].endswith(
-        "1 NaN"
-    )
+    assert lines[2].startswith("line 1 y: 2 values, 2..2,")
+    assert lines[2].endswith("1 NaN")
     # The x of line 2 repeats that of line 1, and is left out.
     assert lines[3].startswith("line 2 y: 2 values, 5..7,")
     assert lines[4].startswith("patch 1-2 x: 10 values, 0.5..3.5,")
     assert lines[5].startswith("patch 1-2 y: 10 values, 0..4,")
-    assert lines[6].startswith("image 1 value: 4 values, 1..3,") and "1 NaN" in lines[6]
+    assert lines[6].startswith("image 1 value: 4 values, 1..3,")
+    assert "1 NaN" in lines[6]
     assert lines[7].startswith("image 1 extent: 4 values, -0.5..1.5,")
     assert len(lines) == 8
 

@@ -59,9 +59,8 @@ PAIR = [[0, 1], [1, 0]]
 def test_colour_and_style_pairs_repeat_late():
     # 8 and 5 have no common divisor: the pair repeats after 40.
     assert len({(colour(k), str(line_style(k))) for k in range(40)}) == 40
-    assert (
-        len(set(PALETTE)) == 8 and len({str(line_style(8 * k)) for k in range(5)}) == 5
-    )
+    assert len(set(PALETTE)) == 8
+    assert len({str(line_style(8 * k)) for k in range(5)}) == 5
 
 
 def test_axes_are_labelled_with_units():
@@ -71,9 +70,11 @@ def test_axes_are_labelled_with_units():
         "error",
         "Runs",
     )
-    assert ax.get_yscale() == "log" and tuple(ax.figure.get_size_inches()) == SIZE
+    assert ax.get_yscale() == "log"
+    assert tuple(ax.figure.get_size_inches()) == SIZE
     relabelled = axes(xlabel="lag", ylabel="error", ax=ax)
-    assert relabelled is ax and ax.get_xlabel() == "lag"
+    assert relabelled is ax
+    assert ax.get_xlabel() == "lag"
 
 
 def test_ellipse_holds_its_share():
@@ -84,13 +85,15 @@ def test_ellipse_holds_its_share():
     # All points of the outline have the Mahalanobis distance of the level.
     squared = (outline * np.linalg.solve(cov, outline.T).T).sum(axis=1)
     assert np.allclose(squared, -2 * np.log(0.2), rtol=1e-10)
-    assert ax.lines[0].get_color() == PALETTE[1] and ax.lines[0].get_label() == "A"
+    assert ax.lines[0].get_color() == PALETTE[1]
+    assert ax.lines[0].get_label() == "A"
     assert ax.lines[1].get_xydata().tolist() == [mean.tolist()]
     # A covariance of rank one gives a line.
     line = (
         plotting.ellipse(blank(), mean, [[4.0, 0.0], [0.0, 0.0]]).lines[0].get_xydata()
     )
-    assert np.allclose(line[:, 1], -2.0) and np.ptp(line[:, 0]) > 9
+    assert np.allclose(line[:, 1], -2.0)
+    assert np.ptp(line[:, 0]) > 9
 
 
 def test_band_shows_median_and_quantiles():
@@ -124,7 +127,8 @@ def test_graph_fills_discs_and_writes_notes():
     ax = graph(blank(), PAIR, labels=["A", "B"], known=[0.0, 1.0], notes=["angle", ""])
     # White for 0, the palette's colour for 1, mixed linearly between
     empty, full = ax.collections[0].get_facecolors()
-    assert empty.tolist() == [1, 1, 1, 1] and np.allclose(full[:3], to_rgb(colour(5)))
+    assert empty.tolist() == [1, 1, 1, 1]
+    assert np.allclose(full[:3], to_rgb(colour(5)))
     half = graph(blank(), PAIR, known=[0.5, 0.5]).collections[0].get_facecolors()[0]
     assert np.allclose(half[:3], 0.5 + 0.5 * np.array(to_rgb(colour(5))))
     assert [t.get_text() for t in ax.texts] == ["A", "angle", "B"]
@@ -151,7 +155,8 @@ def test_a_slider_holds_its_frames_and_nothing_else():
         curve, rates, label="rate", unit="1/s", alt="A curve <falls>.", start=2
     )
     assert result.labels == ("rate 0 1/s", "rate 0.5 1/s", "rate 1 1/s", "rate 2 1/s")
-    assert len(set(result.frames)) == 4 and not pyplot.get_fignums()
+    assert len(set(result.frames)) == 4
+    assert not pyplot.get_fignums()
     # The page has one picture and one slider, and all frames as data.
     find, data = parse(result.html)
     (image,) = find("img")
@@ -159,7 +164,8 @@ def test_a_slider_holds_its_frames_and_nothing_else():
     assert image["alt"] == "A curve <falls>. rate 1 1/s."
     # The page shows the frame `start`, at half of its pixels.
     first = base64.b64decode(image["src"].removeprefix("data:image/webp;base64,"))
-    assert first == result.frames[2] and first[8:12] == b"WEBP"
+    assert first == result.frames[2]
+    assert first[8:12] == b"WEBP"
     first_frame = Image.open(io.BytesIO(first))
     assert first_frame.size == tuple(2 * n for n in result.size)
     assert [image["width"], image["height"]] == [str(n) for n in result.size]
@@ -169,13 +175,14 @@ def test_a_slider_holds_its_frames_and_nothing_else():
         "3",
         "2",
     )
-    assert knob["aria-label"] == "rate" and len(find("button")) == 1
+    assert knob["aria-label"] == "rate"
+    assert len(find("button")) == 1
     assert [base64.b64decode(f) for f in data["frames"]] == list(result.frames)
-    assert data["said"] == list(result.labels) and data["milliseconds"] == 500
+    assert data["said"] == list(result.labels)
+    assert data["milliseconds"] == 500
     # It needs no network: no address, and no script from a file.
-    assert "http" not in result.html and not any(
-        "src" in s.attrs for s in find("script")
-    )
+    assert "http" not in result.html
+    assert not any("src" in s.attrs for s in find("script"))
     assert len(result.html) < 100_000
     bundle = result._repr_mimebundle_()
     assert set(bundle) == {"text/plain", "text/html", "image/png"}
@@ -191,7 +198,8 @@ def test_a_slider_is_reproducible_and_its_text_changes_with_a_frame():
         for last in (1.0, 1.0, 1.01, 0.99)
     ]
     # Equal arguments give equal bytes; a changed curve another text.
-    assert sliders[0].html == sliders[1].html and len({repr(s) for s in sliders}) == 3
+    assert sliders[0].html == sliders[1].html
+    assert len({repr(s) for s in sliders}) == 3
     assert (
         len({re.search('data-frames="([0-9a-f]{16})"', s.html)[1] for s in sliders})
         == 3
@@ -202,7 +210,8 @@ def test_texts_of_a_slider_cannot_end_its_script():
     result = slider(curve, [1.0], label="rate", alt="</script><b>x</b>")
     # The parser would find the bold text if the script had ended.
     find, data = parse(result.html)
-    assert data["alt"] == "</script><b>x</b>" and not find("b")
+    assert data["alt"] == "</script><b>x</b>"
+    assert not find("b")
 
 
 def test_a_table_formats_numbers_and_marks_the_best_one():
@@ -219,7 +228,6 @@ def test_a_table_formats_numbers_and_marks_the_best_one():
         ["y", "nan", "c"],
         ["z", "0.40", "d"],
     ]
-    assert [b.text for b in page.find_all("b")] == [
-        "0.40"
-    ] and page.caption.text == "Error"
+    assert [b.text for b in page.find_all("b")] == ["0.40"]
+    assert page.caption.text == "Error"
     assert repr(result).split() == ["Error", *rows[0][1:], *rows[1], *rows[2], *rows[3]]

@@ -55,7 +55,8 @@ def test_every_published_file_is_of_an_item_and_lists_its_claims() -> None:
         # A figure has claims; a table has values, and claims in a second file.
         rows = table(path.parent.name, path.stem)
         claims = path.stem.startswith("figure") or path.stem.endswith("-claims")
-        assert rows and (path.parent.name, path.stem.removesuffix("-claims")) in of_item
+        assert rows
+        assert (path.parent.name, path.stem.removesuffix("-claims")) in of_item
         if claims:
             assert list(rows[0]) == ["id", "claim", "criterion"]
             assert all(cell.strip() for row in rows for cell in row.values())
@@ -118,21 +119,24 @@ def test_a_fault_is_named_with_the_file(
     path.write_text(GOOD)
     study = read_scenario(path)
     # Without the fault the file is read.
-    assert study["gain"] == 0.05 and study.changes == (
-        "some/study is no scenario of the book",
-    )
+    assert study["gain"] == 0.05
+    assert study.changes == ("some/study is no scenario of the book",)
     path.write_text(GOOD.replace(old, new, 1))
     with pytest.raises(ValueError, match=f"^some/study.toml: (?s:.*){words}"):
         read_scenario(path)
 
 
 def test_values_are_the_file_s_and_cannot_be_changed() -> None:
-    assert S["gain"] == 0.05 and S["members"] == 200 and "gain" in S and "gian" not in S
+    assert S["gain"] == 0.05
+    assert S["members"] == 200
+    assert "gain" in S
+    assert "gian" not in S
     assert S["initial_state"].tolist() == [100.0, 0.0, 0.0, 10.0, 0.1, 0.0]
     # A study that changed its input would no longer be the one that is described.
     with pytest.raises(ValueError, match="read-only"):
         S["initial_state"][0] = 0.0
-    assert S.agents[1].dims == (1, 2) and S.agents[1]["noise"] == 0.2
+    assert S.agents[1].dims == (1, 2)
+    assert S.agents[1]["noise"] == 0.2
     assert S.adjacency.tolist() == [[0, 1, 1], [1, 0, 0], [1, 0, 0]]
 
 
@@ -146,7 +150,8 @@ def test_a_change_is_noticed_and_named() -> None:
     )
     # The digest depends on the values only, not on how they were set.
     back = other.replace(gain=0.05, initial_state=S["initial_state"])
-    assert not back.changes and back.digest == S.digest != other.digest
+    assert not back.changes
+    assert back.digest == S.digest != other.digest
 
 
 @pytest.mark.parametrize(
@@ -180,11 +185,9 @@ def test_a_changed_file_is_noticed_by_its_values(
     # Values count, texts such as the place in the paper do not.
     path.write_text(text.replace(old, new))
     other = read_scenario(path)
-    assert (
-        old in text
-        and other.changes == changes
-        and (other.digest == S.digest) == (not changes)
-    )
+    assert old in text
+    assert other.changes == changes
+    assert (other.digest == S.digest) == (not changes)
 
 
 def test_a_scenario_prints_every_parameter_and_its_reason() -> None:
@@ -193,11 +196,14 @@ def test_a_scenario_prints_every_parameter_and_its_reason() -> None:
     markdown = S._repr_markdown_()
     # Each form of the table has every parameter with its source and reason.
     for p in (*S.parameters.values(), *S.notes.values()):
-        assert p.name in text and f">{p.name}<" in page and f"| {p.name} |" in markdown
-        assert p.source in markdown and p.why.replace("|", r"\|") in markdown
-    assert (
-        ">100, 0, 0, 10, 0.1, 0<" in page and ">A, B, C<" in page and "A, B, C" in text
-    )
+        assert p.name in text
+        assert f">{p.name}<" in page
+        assert f"| {p.name} |" in markdown
+        assert p.source in markdown
+        assert p.why.replace("|", r"\|") in markdown
+    assert ">100, 0, 0, 10, 0.1, 0<" in page
+    assert ">A, B, C<" in page
+    assert "A, B, C" in text
     assert (
         len({len(line.split("|")) for line in markdown.split("\n\n")[0].splitlines()})
         == 1
@@ -215,9 +221,9 @@ def test_reads_of_agents_are_recorded() -> None:
     # Showing a scenario, or asking for changes, reads no cell for the study.
     repr(one), one._repr_html_(), one.digest, one.changes
     first = one.agents[0]
-    assert (
-        first.dims == (0, 1) and first.get("noise") == 0.2 and first.where == "Table II"
-    )
+    assert first.dims == (0, 1)
+    assert first.get("noise") == 0.2
+    assert first.where == "Table II"
     # A worker of a study gets a copy, with the cells read so far.
     travelled = pickle.loads(pickle.dumps(one))
     # Rows are matched by name, in any order.
@@ -227,7 +233,8 @@ def test_reads_of_agents_are_recorded() -> None:
         == travelled.cells()
     )
     assert two.cells()[0] == {"name": "A"}
-    assert (one.adjacency == S.adjacency).all() and "neighbours" in one.cells()[2]
+    assert (one.adjacency == S.adjacency).all()
+    assert "neighbours" in one.cells()[2]
 
 
 def use_all(study: Scenario) -> Scenario:
@@ -299,8 +306,10 @@ def test_formulas_are_compared_without_spaces() -> None:
 def test_every_claim_has_to_hold() -> None:
     # The order of the claims does not matter.
     match = judge_claims("grange", "Fig. 1", CLAIMS[::-1])
-    assert match.verdict == "match" and "pca-stable holds: share 0" in match.ours
-    assert "unstable" in match.published and match.why == ""
+    assert match.verdict == "match"
+    assert "pca-stable holds: share 0" in match.ours
+    assert "unstable" in match.published
+    assert match.why == ""
     differs = judge_claims("grange", "Fig. 1", DENIED, why="it is an EnKF")
     assert (differs.verdict, differs.why) == ("differs", "it is an EnKF")
     # A difference needs a reason, a match has none.
@@ -400,7 +409,8 @@ def test_a_changed_scenario_is_not_compared() -> None:
     ):
         why = "changed scenario: gain: 0.1, not 0.05"
         assert (verdict.verdict, verdict.why) == ("not comparable", why)
-        assert verdict.ours and verdict.published
+        assert verdict.ours
+        assert verdict.published
     # The accepted scenario itself is compared, recorded or not.
     for study in (None, S, S.track_reads()):
         assert (

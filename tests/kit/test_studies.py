@@ -79,9 +79,8 @@ def test_seeds_are_numpy_s_own_children_whatever_was_spawned_from_them() -> None
         study = studies.run(
             lambda s: s.spawn(1)[0].generate_state(2), [ours, theirs], workers=1
         )
-        assert (
-            np.array(study.values) == first
-        ).all() and theirs.n_children_spawned == 3
+        assert (np.array(study.values) == first).all()
+        assert theirs.n_children_spawned == 3
     study = studies.run(lambda s: s.generate_state(2), [5], workers=1)
     assert (study.values[0] == SeedSequence(5).generate_state(2)).all()
 
@@ -129,7 +128,8 @@ def test_a_raised_trial_is_reported_with_its_seed_and_the_others_are_kept(
 ) -> None:
     trial = partial(fails_at, (3, 11))
     study = studies.run(trial, SEEDS, workers=workers, errors="collect")
-    assert [f.which for f in study.failures] == [3, 11] and study.done.sum() == 28
+    assert [f.which for f in study.failures] == [3, 11]
+    assert study.done.sum() == 28
     assert study.failures[1].kind == "ArithmeticError"
     assert "spawn_key=(11,)" in str(study.failures[1])
     assert "no value for 11" in str(study.failures[1])
@@ -138,7 +138,8 @@ def test_a_raised_trial_is_reported_with_its_seed_and_the_others_are_kept(
         trial(study.failures[0].seed)
     with pytest.raises(StudyError, match="trial 3, SeedSequence") as caught:
         studies.run(trial, SEEDS, workers=workers)
-    assert caught.value.study is not None and caught.value.study.done.sum() == 28
+    assert caught.value.study is not None
+    assert caught.value.study.done.sum() == 28
 
 
 @pytest.mark.parametrize("bad", [5, 29])
@@ -160,7 +161,8 @@ def test_a_broken_executor_leaves_what_was_done() -> None:
         # An executor of the caller cannot be replaced, so the study stops.
         with pytest.raises(StudyError, match="the executor broke") as caught:
             studies.run(partial(dies_at, 29), SEEDS, executor=pool)
-        assert caught.value.study is not None and 0 < caught.value.study.done.sum() < 30
+        assert caught.value.study is not None
+        assert 0 < caught.value.study.done.sum() < 30
 
 
 class Cluster(Executor):
@@ -217,7 +219,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_file_gives_back_every_bit(whole: Path) -> None:
     study = studies.load(whole)
     assert np.stack([study.columns[c] for c in COLUMNS], axis=1).tobytes() == REFERENCE
-    assert study.parameters == {"size": 40} and len(study) == 30
+    assert study.parameters == {"size": 40}
+    assert len(study) == 30
     assert study.metadata["code"] == {"draw": studies.fingerprint(draw)}
 
 
@@ -251,7 +254,8 @@ def test_any_number_and_seed_comes_back(
 
 def test_a_failure_is_stored_by_its_class(tmp_path: Path) -> None:
     study = studies.load(store(tmp_path / "a.csv", trial=partial(fails_at, (3,))))
-    assert study.failures[3] == "ArithmeticError" and np.isnan(study.columns["mean"][3])
+    assert study.failures[3] == "ArithmeticError"
+    assert np.isnan(study.columns["mean"][3])
     assert study.metric("mean").shape == (29,)
     # A failure of the same kind is the stored result.
     studies.check(study, partial(fails_at, (3,)))

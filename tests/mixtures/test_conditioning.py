@@ -178,7 +178,8 @@ def test_a_gate_measures_from_the_nearest_component() -> None:
 
     # The gate is a Mahalanobis distance with S = P + R.
     y = np.array([1.0, -2.0])
-    distance = np.sqrt(y @ np.linalg.solve(cov + noise, y))
+    whitened = np.linalg.solve(cov + noise, y)
+    distance = np.sqrt(y @ whitened)
     assert is_inside(y.tolist(), 1.001 * distance)
     assert not is_inside(y.tolist(), 0.999 * distance)
     # The second component is at 50; halfway between both, 25 is far from each.
@@ -236,14 +237,16 @@ def test_stretching_is_the_largest_image() -> None:
     u, length = nonlinearity(P.factors, g, scale=scale)
     for k in range(4):
         # uᵀ P⁻¹ u = 1: one standard deviation; its image has the length ‖D G u‖.
-        squared_distance = u[k] @ np.linalg.solve(P.covs[k], u[k])
+        whitened = np.linalg.solve(P.covs[k], u[k])
+        squared_distance = u[k] @ whitened
         assert np.isclose(squared_distance, 1)
         image = scale * (g[k] @ u[k])
         assert np.isclose(np.linalg.norm(image), length[k])
         # No other direction of one standard deviation has a larger image.
         z = rng.standard_normal((500, 3))
         z /= np.linalg.norm(z, axis=1, keepdims=True)
-        images = scale * (z @ P.factors[k].T @ g[k].T)
+        anomalies = z @ P.factors[k].T
+        images = scale * (anomalies @ g[k].T)
         assert np.linalg.norm(images, axis=1).max() <= length[k]
 
 

@@ -38,6 +38,21 @@ OTHER = random_mixture(2, 2, 2)
 EVERY_RULE = pytest.mark.parametrize("rule", ["C1", "C2", "C3", "points"])
 
 
+@EVERY_RULE
+def test_a_single_component_has_all_the_weight(rule: str) -> None:
+    """The fusion of Gaussians is one, whatever the rule of the weights."""
+    exact = PartialFusion(random_mixture(1, 4, 5), random_mixture(1, 2, 6))
+    shapes = exact.component_shapes()
+    fused = exact.assign_weights(shapes, rule=rule)
+    assert fused.weights.tolist() == [1.0]
+    np.testing.assert_array_equal(fused.means, shapes.means)
+    np.testing.assert_array_equal(fused.covs, shapes.covs)
+    # The exact density is the Gaussian's, up to its constant.
+    points = fused.means + np.random.default_rng(7).standard_normal((5, 4))
+    difference = exact.log_value(points) - fused.log_density(points)
+    assert np.ptp(difference) < 1e-9
+
+
 def fuse_by_information(
     prior: GaussianMixture,
     q: int,
@@ -258,11 +273,14 @@ def collocation_coefficients(
     logs = f.log_value(points)
     p = np.exp(logs - logs.max())
     differences = points[:, None] - shapes.means
-    white = np.linalg.solve(shapes.covs, differences[..., None])[..., 0]
+    columns = differences[..., None]
+    white = np.linalg.solve(shapes.covs, columns)[..., 0]
     # Column l is the term exp(-½ (x - m_l)ᵀ P_l⁻¹ (x - m_l)) at all points x.
     squares = (differences * white).sum(axis=-1)
     matrix = np.exp(-0.5 * squares)
-    scale = np.ones(p.size) if rule == "C3" else 1 / np.sqrt(p + 1e-3)
+    scale = np.ones(p.size)
+    if rule != "C3":
+        scale = 1 / np.sqrt(p + 1e-3)
     return nonnegative_least_squares(matrix * scale[:, None], p * scale)
 
 

@@ -29,7 +29,8 @@ def test_acceleration_is_the_gradient_of_the_potential() -> None:
     h = 1e-2
     gradient = np.empty_like(r)
     for axis, shift in enumerate(h * np.eye(3)):
-        gradient[:, axis] = (potential(r + shift) - potential(r - shift)) / (2 * h)
+        difference = potential(r + shift) - potential(r - shift)
+        gradient[:, axis] = difference / (2 * h)
     error = np.abs(gradient - acceleration(r)).max()
     assert error < 1e-7 * np.abs(gradient).max()
 

@@ -32,8 +32,10 @@ def system(
         if i < j:
             # |B_i x_i + B_j x_j|² with two random blocks
             row = np.zeros((d, n * d))
-            row[:, i * d : (i + 1) * d] = draw.standard_normal((d, d)) + 2 * np.eye(d)
-            row[:, j * d : (j + 1) * d] = draw.standard_normal((d, d)) - 2 * np.eye(d)
+            first = draw.standard_normal((d, d)) + 2 * np.eye(d)
+            second = draw.standard_normal((d, d)) - 2 * np.eye(d)
+            row[:, i * d : (i + 1) * d] = first
+            row[:, j * d : (j + 1) * d] = second
             joint += row.T @ row
     # A larger diagonal makes rounds converge on any graph.
     if slack:
@@ -100,7 +102,8 @@ def test_lost_messages_only_cost_time_run_by_run() -> None:
     path = TREES["path"]
     matrices, vectors, couplings, joint = system(path)
     faults = Faults(loss=0.5, seed=1)
-    runs = np.tile(matrices, (4, 1, 1, 1)), np.stack([vectors * k for k in range(4)])
+    factors = np.arange(4)[:, None, None]
+    runs = (np.tile(matrices, (4, 1, 1, 1)), factors * vectors)
     channel = Channel(path, runs=(4,), faults=faults)
     means, _ = gaussian_belief_propagation(*runs, couplings, channel, rounds=60)
     # Run k has k times the vector, and so k times the solution.
@@ -112,7 +115,7 @@ def test_lost_messages_only_cost_time_run_by_run() -> None:
     few, _ = gaussian_belief_propagation(
         *runs, couplings, Channel(path, runs=(4,), faults=faults), rounds=5
     )
-    assert np.abs(few - np.arange(4)[:, None, None] * expected).max() > 1e-3
+    assert np.abs(few - factors * expected).max() > 1e-3
 
 
 def test_what_is_refused() -> None:

@@ -11,6 +11,7 @@ import pytest
 from distfilt import gaussians as pure
 from distfilt import network
 from distfilt.network import Channel, Faults, Graph, graphs
+from distfilt.sensors import wrap
 from tests.network.helpers import DISK, STAR, arrivals, gaussians, rng, star
 
 Array = np.ndarray
@@ -33,7 +34,8 @@ def is_below(small: Array, large: Array, tolerance: float = 1e-7) -> bool:
     # L⁻¹ S L⁻ᵀ has no eigenvalue above 1.
     lower = np.linalg.cholesky(large)
     white = np.linalg.solve(lower, np.linalg.solve(lower, small).mT)
-    return bool((np.linalg.eigvalsh(0.5 * (white + white.mT)) < 1 + tolerance).all())
+    eigenvalues = np.linalg.eigvalsh(0.5 * (white + white.mT))
+    return bool((eigenvalues < 1 + tolerance).all())
 
 
 def gains(rule: Any, p_a: Array, p_b: Array) -> tuple[Array, Array, Array]:
@@ -46,15 +48,23 @@ def gains(rule: Any, p_a: Array, p_b: Array) -> tuple[Array, Array, Array]:
     # Column k is the response to a unit of the second mean along axis k.
     columns = [rule(zero, p_a, axis, p_b)[0] for axis in np.eye(d)]
     gain_b = np.stack(columns, axis=-1)
-    return np.eye(d) - gain_b, gain_b, rule(zero, p_a, zero, p_b)[1]
+    _, cov = rule(zero, p_a, zero, p_b)
+    return np.eye(d) - gain_b, gain_b, cov
+
+
+def covariance_of_sum(
+    k: Array, g: Array, p_a: Array, p_b: Array, cross: Array
+) -> Array:
+    """Return the covariance of K e_a + G e_b, with the cross-covariance C = E[e_a e_bᵀ]."""
+    # K P_a Kᵀ + G P_b Gᵀ + K C Gᵀ + G Cᵀ Kᵀ
+    mixed = k @ cross @ g.mT
+    return k @ p_a @ k.mT + g @ p_b @ g.mT + mixed + mixed.mT
 
 
 def error_covariance(rule: Any, p_a: Array, p_b: Array, cross: Array) -> Array:
     """Return the covariance of the fused error, for a cross-covariance E[e_a e_bᵀ]."""
     k, g, _ = gains(rule, p_a, p_b)
-    # K P_a Kᵀ + G P_b Gᵀ + K C Gᵀ + G Cᵀ Kᵀ
-    mixed = k @ cross @ g.mT
-    return k @ p_a @ k.mT + g @ p_b @ g.mT + mixed + mixed.mT
+    return covariance_of_sum(k, g, p_a, p_b, cross)
 
 
 # Inverse covariance intersection.
@@ -71,9 +81,10 @@ def test_inverse_intersection_by_its_equation(omega: float) -> None:
     k = expected @ (inverse(p_a) - omega * common)
     g = expected @ (inverse(p_b) - (1 - omega) * common)
     assert np.allclose(cov, expected, rtol=1e-6)
-    expected_mean = (k @ mean_a[..., None] + g @ mean_b[..., None])[..., 0]
+    expected_mean = k @ mean_a[..., None] + g @ mean_b[..., None]
     std = np.sqrt(np.diagonal(expected, axis1=-2, axis2=-1))
-    assert (np.abs(mean - expected_mean) < 1e-6 * std).all()
+    error = np.abs(mean - expected_mean[..., 0])
+    assert (error < 1e-6 * std).all()
 
 
 @each_omega
@@ -91,9 +102,9 @@ def test_inverse_intersection_bounds_the_error_with_common_information(
     assert is_below(error_covariance(rule, p_a, p_b, cross), reported)
     # Control: the product of the densities counts the common estimate twice.
     product = inverse(inverse(p_a) + inverse(p_b))
-    k, g = product @ inverse(p_a), product @ inverse(p_b)
-    mixed = k @ cross @ g.mT
-    error = k @ p_a @ k.mT + g @ p_b @ g.mT + mixed + mixed.mT
+    k = product @ inverse(p_a)
+    g = product @ inverse(p_b)
+    error = covariance_of_sum(k, g, p_a, p_b, cross)
     assert not is_below(error, product)
 
 
@@ -126,7 +137,9 @@ def test_the_weight_makes_the_result_smallest(fuse: Any, rule: str) -> None:
 
     # No weight of a fine grid gives a smaller one.
     others = [size(omega=w) for w in np.linspace(0.0, 1.0, 201)]
-    assert (size() < np.min(others, axis=0) + 1e-4 * np.abs(size())).all()
+    smallest = np.min(others, axis=0)
+    chosen = size()
+    assert (chosen < smallest + 1e-4 * np.abs(chosen)).all()
 
 
 # Ellipsoidal intersection.
@@ -145,15 +158,18 @@ def test_ellipsoidal_intersection_by_the_papers_equations() -> None:
         d_j, s_j = np.linalg.eigh(white)
         transform = root @ s_j
         mutual = transform @ np.diag(np.maximum(1.0, d_j)) @ transform.T
-        i_a, i_b, i_m = inverse(p_a[k]), inverse(p_b[k]), inverse(mutual)
-        gamma = np.linalg.solve(
-            i_a + i_b - 2 * i_m, (i_b - i_m) @ mean_a[k] + (i_a - i_m) @ mean_b[k]
-        )
+        i_a = inverse(p_a[k])
+        i_b = inverse(p_b[k])
+        i_m = inverse(mutual)
+        # The mean γ of the mutual information
+        crossed = (i_b - i_m) @ mean_a[k] + (i_a - i_m) @ mean_b[k]
+        gamma = np.linalg.solve(i_a + i_b - 2 * i_m, crossed)
         expected = inverse(i_a + i_b - i_m)
         assert np.allclose(cov[k], expected, rtol=1e-6)
         total = i_a @ mean_a[k] + i_b @ mean_b[k] - i_m @ gamma
         std = np.sqrt(np.diagonal(expected))
-        assert (np.abs(mean[k] - expected @ total) < 1e-5 * std).all()
+        error = np.abs(mean[k] - expected @ total)
+        assert (error < 1e-5 * std).all()
     assert is_below(cov, p_a)
     assert is_below(cov, p_b)
 
@@ -206,6 +222,32 @@ def test_split_intersection_bounds_the_error_for_any_correlation(omega: float) -
     )
     expected = k @ independent[0] @ k.mT + g @ independent[1] @ g.mT
     assert np.allclose(rest, expected, rtol=1e-6)
+
+
+@each_omega
+def test_split_intersection_by_its_equation(omega: float) -> None:
+    """P⁻¹ = (D_a/ω + I_a)⁻¹ + (D_b/(1 - ω) + I_b)⁻¹, and the mean by these informations."""
+    dependent = covariances(10), covariances(11)
+    independent = covariances(12), covariances(13)
+    mean_a, mean_b = gaussians(14, 2, N, d=3)[0]
+    mean, part, rest = pure.intersect_split(
+        mean_a,
+        dependent[0],
+        independent[0],
+        mean_b,
+        dependent[1],
+        independent[1],
+        omega=omega,
+    )
+    information_a = inverse(dependent[0] / omega + independent[0])
+    information_b = inverse(dependent[1] / (1 - omega) + independent[1])
+    expected = inverse(information_a + information_b)
+    assert np.allclose(part + rest, expected, rtol=1e-6)
+    vector_a = information_a @ mean_a[..., None]
+    vector_b = information_b @ mean_b[..., None]
+    expected_mean = (expected @ (vector_a + vector_b))[..., 0]
+    std = np.sqrt(np.diagonal(expected, axis1=-2, axis2=-1))
+    assert (np.abs(mean - expected_mean) < 1e-6 * std).all()
 
 
 @pytest.mark.parametrize("rule", ["min_trace", "min_determinant"])
@@ -312,12 +354,13 @@ def test_split_parts_in_a_network(loss: float) -> None:
     channel = Channel(graph, runs=(2,), faults=faults)
     fused = network.split_covariance_intersection((m, dependent, independent), channel)
     assert (channel.ledger.scalars == 8 * graph.out_degree).all()
+    belief = (m, dependent, independent)
     for run, arrived in enumerate(arrivals(faults, graph, runs=2)):
         for agent in range(4):
-            parts = m[run, agent], dependent[run, agent], independent[run, agent]
+            parts = [part[run, agent] for part in belief]
             for j in graph.neighbours(agent):
                 if arrived[agent, j]:
-                    other = m[run, j], dependent[run, j], independent[run, j]
+                    other = [part[run, j] for part in belief]
                     parts = pure.intersect_split(*parts, *other)
             for value, expected in zip(fused, parts, strict=True):
                 assert np.allclose(value[run, agent], expected, rtol=1e-6, atol=1e-9)
@@ -327,12 +370,13 @@ def test_what_was_sent_is_dependent_in_the_next_round() -> None:
     m, dependent = gaussians(3, 4, d=2)
     _, independent = gaussians(4, 4, d=2)
     rule = network.split_covariance_intersection
-    twice = rule((m, dependent, independent), Channel(graphs.path(4)), rounds=2)
-    once = rule((m, dependent, independent), Channel(graphs.path(4)))
-    again = (once[0], once[1] + once[2], 0 * once[2])
-    for value, expected in zip(
-        twice, rule(again, Channel(graphs.path(4))), strict=True
-    ):
+    belief = (m, dependent, independent)
+    path = graphs.path(4)
+    after_two = rule(belief, Channel(path), rounds=2)
+    means, still_dependent, sent = rule(belief, Channel(path))
+    again = (means, still_dependent + sent, 0 * sent)
+    after_again = rule(again, Channel(path))
+    for value, expected in zip(after_two, after_again, strict=True):
         assert np.allclose(value, expected)
 
 
@@ -342,11 +386,17 @@ def test_angles_are_fused_the_shorter_way_round(name: str) -> None:
     channel = star()
     channel.periods = (2 * np.pi, None)
     m = np.array([[3.1, 0.0], [-3.1, 1.0], [3.0, 2.0]])
-    p = np.array([np.diag([1.0, 2.0]), np.diag([2.0, 1.0]), np.eye(2)])
+    p = np.array(
+        [
+            [[1.0, 0.0], [0.0, 2.0]],
+            [[2.0, 0.0], [0.0, 1.0]],
+            [[1.0, 0.0], [0.0, 1.0]],
+        ]
+    )
     means, covs = rule((m, p), channel)
     # The same places on one branch
     turned = m + [[0, 0], [2 * np.pi, 0], [0, 0]]
     expected, expected_covs = rule((turned, p), star())
-    difference = np.angle(np.exp(1j * (means[:, 0] - expected[:, 0])))
+    difference = wrap(means[:, 0] - expected[:, 0])
     assert np.abs(difference).max() < 1e-6
     assert np.allclose(covs, expected_covs)

@@ -35,6 +35,7 @@ from distfilt.filters import (
     ParticleFilter,
     TransportFilter,
 )
+from distfilt.filters.step import predict_points
 from distfilt.mixtures import GaussianMixture, target_fusion
 from distfilt.models import LinearModel, Model, pendulum_angle
 from distfilt.network import Channel, graphs
@@ -535,27 +536,76 @@ def test_a_transition_that_wraps_undeclared_warns_once(family: str) -> None:
     assert abs(wrap(f.summarize(state).mean[0, 0] - want)) < tolerance(family)
 
 
-def test_angles_over_more_than_half_a_period_follow_the_tangent() -> None:
-    """A point at (3, 3) ± 5 and the angle of a line, 1.2: regressions have the tangent's sign.
+def test_predictions_lie_within_half_a_period_of_the_mean_s() -> None:
+    """By hand: the point (-1, 2) is seen at arctan(-2) = -1.11, and not half a turn farther.
 
-    Predictions near that of the mean, one by one, gave the opposite sign: points beyond the
-    jump of the angle counted on the wrong side.
+    The tangent at the mean, (1, 0), leads to 2 there, next to -1.11 + π. Most points lie at the
+    mean, so that the tangent's values have a standard deviation of only 0.31.
     """
-    still_point = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
-    prior = [3.0, 3.0], 25.0 * np.eye(2)
+    others = np.array([[-1.0, 2.0], [3.0, -2.0], [1.0, 1.0], [1.0, -1.0]])
+    points = np.concatenate([np.tile([1.0, 0.0], (98, 1)), others])
+    predicted = predict_points(line_angle((0, 1), std=0.1), points)[:, 0]
+    assert np.allclose(predicted[:98], 0.0, atol=1e-12)
+    by_hand = [-np.arctan(2.0), -np.arctan(2 / 3), np.pi / 4, -np.pi / 4]
+    assert np.allclose(predicted[98:], by_hand)
+
+
+def test_predictions_of_a_compass_continue_the_line() -> None:
+    """Headings up to five turns away; the mean is in the middle."""
+    headings = np.linspace(-30.0, 31.0, 62)[:, None]
+    predicted = predict_points(compass(cut=True), headings)
+    steps = np.diff(predicted[:, 0])
+    assert np.allclose(steps, 1.0)
+
+
+WIDE_PRIOR = np.full(2, 3.0), 25.0 * np.eye(2)
+WIDE_FILTERS: dict[str, Callable[..., Any]] = {
+    "unscented": partial(GaussianFilter, linearization="unscented"),
+    "ensemble": partial(EnsembleFilter, members=200),
+}
+
+
+def line_angle_along_the_tangent() -> Sensor:
+    """An angle of a line continued along its tangent at (3, 3), for a comparison."""
     sensor = line_angle((0, 1), std=0.2)
-    filters = {
-        "unscented": GaussianFilter(still_point, [sensor], linearization="unscented"),
-        "ensemble": EnsembleFilter(still_point, [sensor], members=20_000),
-    }
-    # By hand: the slope of the tangent is (-1, 1) / 6, so that its standard deviation,
-    # 5 √2 / 6 = 1.18, is less than half a period, and the mean moves along (-1, 1).
-    for name, f in filters.items():
-        state = f.step(start(f, *prior), 1.0, [[1.2]])
-        y, z = f.summarize(state).mean[0]
-        assert y < 2.5 and z > 3.5, name
-        # The exact direction is 1.17, that of the prior's mean 0.79.
-        assert 1.0 < np.arctan2(z, y) < 1.2, name
+
+    def h(x: np.ndarray) -> np.ndarray:
+        tangent = np.pi / 4 + (x[..., 1:] - x[..., :1]) / 6
+        return sensor.bring_near(sensor.predict(x), tangent)
+
+    return Sensor(1, h, sensor.noise_cov)
+
+
+@pytest.mark.parametrize("family", WIDE_FILTERS)
+def test_the_page_s_wide_prior(family: str) -> None:
+    """A point at (3, 3) ± 5, one angle of a line, truths from the prior: the page's table.
+
+    A branch along the tangent turns predictions to where no observed value is taken: the
+    reported covariance is then half the squared error or less, and one run in thirty is lost.
+    """
+    still_point = Model(2, lambda x, t, dt: x, lambda t, dt: 1e-9 * np.eye(2))
+    rng = np.random.default_rng(4)
+    truth = rng.multivariate_normal(*WIDE_PRIOR, size=2000)[None]
+    wrapped = line_angle((0, 1), std=0.2)
+    # A number without a period is compared as it is: next to the prediction of the mean.
+    y = wrapped.bring_near(wrapped.observe(truth, rng=rng), np.full(1, np.pi / 4))
+    values = []
+    for sensor in (wrapped, line_angle_along_the_tangent()):
+        f = WIDE_FILTERS[family](still_point, [sensor])
+        state = f.start(WIDE_PRIOR, rng=np.random.default_rng(3), runs=(2000,))
+        run = f.run(state, [1.0], [y], truth=truth, scores=("nees", "crps"))
+        nees = run["nees"].values / 2
+        values += [nees.mean(), 100 * (nees > 10).mean(), run["crps"].values.mean()]
+    (row,) = re.findall(
+        rf"^\| {family} \|(.*)\|$", PAGE.read_text("utf-8"), re.MULTILINE
+    )
+    printed = [float(cell.strip().removesuffix("%")) for cell in row.split("|")]
+    # Two digits, rounded
+    assert np.allclose(values, printed, rtol=0.0, atol=0.0055), values
+    # That of the prior N(m, σ²) on average: σ / √π
+    assert f"CRPS of {5 / np.sqrt(np.pi):.2f} m" in PAGE.read_text("utf-8")
+    assert values[0] < 1.4 < 1.8 < values[3]
+    assert values[1] < 0.5 < 3.0 < values[4]
 
 
 def test_near_a_singularity_the_branch_is_that_of_the_mean() -> None:

@@ -7,6 +7,8 @@ robot_localization issue 17         a difference is that from the sensor's own l
 robot_localization issue 261        odometries of different rates beside each other
 robot_localization issue 871        an output of a differential source is missed
 robot_localization pull 804         a change over no time
+ranger_ros2 issue 21                half of an odometer's messages are lost
+ros2_controllers pull 1854          the reference moves only when a change is used
 own                                 the odometer of a neighbour, whose message is lost on the way
 own                                 a series with NaN where a slow odometer has no value
 ==================================  ==========================================================
@@ -76,13 +78,17 @@ def kalman(events: list[Event]) -> tuple[np.ndarray, np.ndarray]:
         f[:2, :2] = [[1.0, t - now], [0.0, 1.0]]
         q = np.zeros((6, 6))
         q[:2, :2] = WALK.Q(now, t - now)
-        m, p, now = f @ m, f @ p @ f.T + q, t
+        m = f @ m
+        p = f @ p @ f.T + q
+        now = t
         numbers = [number for time, number, _ in events if time == t]
         y = np.array([value for time, _, value in events if time == t])
         h = rows[numbers]
-        s = h @ p @ h.T + np.diag([VARIANCES[number] for number in numbers])
+        r = np.diag([VARIANCES[number] for number in numbers])
+        s = h @ p @ h.T + r
         gain = np.linalg.solve(s, h @ p).T
-        m, p = m + gain @ (y - h @ m), p - gain @ h @ p
+        m = m + gain @ (y - h @ m)
+        p = p - gain @ h @ p
         for number in numbers:
             if number < 2:
                 # The sensor compares with the present state from now on.
@@ -90,7 +96,8 @@ def kalman(events: list[Event]) -> tuple[np.ndarray, np.ndarray]:
                 block = slice(2 + 2 * number, 4 + 2 * number)
                 copy[block] = 0.0
                 copy[block, :2] = np.eye(2)
-                m, p = copy @ m, copy @ p @ copy.T
+                m = copy @ m
+                p = copy @ p @ copy.T
     return m[:2], p[:2, :2]
 
 
@@ -146,7 +153,8 @@ def test_a_slow_odometer_and_a_fast_beacon(family: str) -> None:
     prior = ([0.0, 1.0], np.diag([0.01, 0.25]))
     run = f.run(f.start(prior, rng=np.random.default_rng(0)), None, events)
     x, v = run["mean"].values[-1, 0]
-    assert abs(v - 1) < 0.2 and abs(x - 20) < 0.6
+    assert abs(v - 1) < 0.2
+    assert abs(x - 20) < 0.6
 
 
 @EACH
@@ -196,16 +204,25 @@ def test_a_series_with_nan_between(family: str) -> None:
 def test_runs_that_miss_different_changes() -> None:
     """Each run compares with the last change of its own."""
     f = EnsembleFilter(WALK, [ODOMETER], members=4000)
-    y = np.array([[1.0, 1.0], [np.nan, 1.1], [2.1, 0.9], [1.0, np.nan]])
+    y = np.array(
+        [
+            [1.0, 1.0],
+            [np.nan, 1.1],
+            [2.1, 0.9],
+            [1.0, np.nan],
+        ]
+    )
     start = f.start(PRIOR, rng=np.random.default_rng(1), runs=(2,))
     times = np.arange(1.0, 5.0)
     run = f.run(start, times, [y[..., None]])
     for r in range(2):
-        events = [(t, 0, v) for t, v in zip(times, y[:, r], strict=True) if v == v]
+        present = np.flatnonzero(~np.isnan(y[:, r]))
+        events = [(times[k], 0, y[k, r]) for k in present]
         mean, _ = kalman(events)
         if events[-1][0] < 4:
             mean = np.array([mean[0] + mean[1], mean[1]])
-        assert np.abs(run["mean"].values[-1, r, 0] - mean).max() < 0.02
+        error = run["mean"].values[-1, r, 0] - mean
+        assert np.abs(error).max() < 0.02
 
 
 def test_components_of_one_sensor_that_are_missing_one_by_one() -> None:
@@ -213,7 +230,14 @@ def test_components_of_one_sensor_that_are_missing_one_by_one() -> None:
     still = Model(2, lambda x, t, dt: x + dt, lambda t, dt: 1e-6 * np.eye(2))
     f = EnsembleFilter(still, [both], members=500)
     start = f.start((np.zeros(2), 1e-4 * np.eye(2)), rng=np.random.default_rng(0))
-    y = np.array([[1.0, np.nan], [1.0, 2.0], [np.nan, 1.0], [2.0, 1.0]])
+    y = np.array(
+        [
+            [1.0, np.nan],
+            [1.0, 2.0],
+            [np.nan, 1.0],
+            [2.0, 1.0],
+        ]
+    )
     run = f.run(start, np.arange(1.0, 5.0), [y])
     # All changes are what the model says, so nothing moves from there.
     assert np.abs(run["mean"].values[-1, 0] - 4.0).max() < 0.02
@@ -262,3 +286,44 @@ def test_what_cannot_be_compared_is_refused_by_name() -> None:
     own = Observation(1.0, 0, [1.0], ODOMETER)
     with pytest.raises(ValueError, match="observations must name one of the agent's"):
         f.step(start, 1.0, [own, None])
+
+
+# After 4 s without an odometer a transport filter of so few members is too narrow: its variance
+# is .55 of the right one with 150 members, .77 with 400.
+@pytest.mark.parametrize("family", [name for name in FAMILIES if name != "transport"])
+def test_half_of_the_messages_are_lost(family: str) -> None:
+    """ranger_ros2 issue 21: the way is not half of it, as each change reaches back to the last.
+
+    Of both odometers messages are lost, whose changes the next ones have.
+    """
+    make, tolerance = FAMILIES[family]
+    f = make(WALK, [SENSORS])
+    lost = tuple(np.arange(1.0, 13.0, 2.0)) + (4.0, 8.0)
+    events = make_events(lost)
+    assert sum(number == 0 for _, number, _ in events) == 4
+    start = f.start(PRIOR, rng=np.random.default_rng(1))
+    check(f.run(start, None, observations(events)), events, tolerance)
+
+
+@EACH
+def test_a_change_that_is_not_there_moves_no_reference(family: str) -> None:
+    """ros2_controllers pull 1854: what is not there does not move the reference.
+
+    An odometer that gives NaN while it is read too early; the next has the whole change. The
+    beacon between them is used.
+    """
+    make, tolerance = FAMILIES[family]
+    f = make(WALK, [SENSORS])
+    events = [event for event in make_events() if event[1] != 1]
+    kept = [event for event in events if event[:2] != (6.0, 0)]
+    seen = observations(kept)
+    seen.append(Observation(6.0, 0, [np.nan], 0))
+    start = f.start(PRIOR, rng=np.random.default_rng(1))
+    # The change at 8 s is that since 4 s.
+    change = sum(
+        value for t, number, value in events if number == 0 and t in (6.0, 8.0)
+    )
+    place = [(o.t, o.sensor) for o in seen].index((8.0, 0))
+    seen[place] = Observation(8.0, 0, [change], 0)
+    whole = [(t, n, change if (t, n) == (8.0, 0) else v) for t, n, v in kept]
+    check(f.run(start, None, seen), whole, tolerance)

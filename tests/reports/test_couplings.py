@@ -6,6 +6,8 @@
 | PythonOT/POT 229 | the optimal plan is missed beside entries of 1e32 |
 | PythonOT/POT 54 | masses of zero in the entropic problem |
 | ott-jax/ott 578 | a constant added to the cost changes its scale |
+| ott-jax/ott 165 | couplings that are impossible: infinite costs |
+| Thinklab-SJTU/pygmtools 100 | a soft assignment that is not near the assignment |
 | own | one far member outweighs the others' distances in the tie-breaker |
 | own | forbidden links at 1e6, 1e15 and 1e30 |
 """
@@ -62,7 +64,8 @@ def test_forbidden_links_do_not_spoil_the_others(seed: int, forbidden: float) ->
     x = rng.normal(size=(12, 2))
     y = x + 0.2 * rng.normal(size=(12, 2))
     cost = squared_distances(x, y)
-    is_forbidden = (rng.random((12, 12)) < 0.4) & ~np.eye(12, dtype=bool)
+    is_diagonal = np.eye(12, dtype=bool)
+    is_forbidden = (rng.random((12, 12)) < 0.4) & ~is_diagonal
     i, j = linear_sum_assignment(np.where(is_forbidden, 1e4, cost))
     expected = cost[i, j].mean()
     cost[is_forbidden] = forbidden
@@ -141,7 +144,8 @@ def test_a_far_member_does_not_outweigh_the_others(far: float, weight: float) ->
     """The near members are those of the monotone plan, and the mean is exact."""
     rng = np.random.default_rng(3)
     x = np.append(rng.normal(size=29), far)
-    weights = np.append(rng.dirichlet(np.ones(29)) * (1 - weight), weight)
+    others = rng.dirichlet(np.ones(29)) * (1 - weight)
+    weights = np.append(others, weight)
     with np.errstate(divide="ignore"):
         logs = np.log(weights)
     after = transform_ensemble(x[:, None], logs)[:, 0]
@@ -201,7 +205,63 @@ def test_two_far_clusters_are_transformed_alike() -> None:
     rows = np.kron(np.eye(8), np.ones(8))
     columns = np.kron(np.ones(8), np.eye(8))
     sums = np.concatenate([part, np.full(8, 1 / 8)])
-    plan = linprog(cost.ravel(), A_eq=np.vstack([rows, columns]), b_eq=sums).x
+    constraints = np.vstack([rows, columns])
+    plan = linprog(cost.ravel(), A_eq=constraints, b_eq=sums).x
     expected = 8 * plan.reshape(8, 8).T @ near
     assert np.abs(after[:8] - expected).max() < 1e-6
-    assert np.abs(after[8:] - [2e5, 0.0] - expected).max() < 1e-6
+    error = after[8:] - [2e5, 0.0] - expected
+    assert np.abs(error).max() < 1e-6
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_impossible_couplings_are_told_by_a_large_finite_cost(solver: Solver) -> None:
+    """ott-jax/ott 165: infinity is refused by name; 1e12 is the linear program without the link."""
+    rng = np.random.default_rng(4)
+    cost = rng.random((6, 5))
+    rows, columns = np.full(6, 1 / 6), np.full(5, 1 / 5)
+    is_forbidden = np.add.outer(np.arange(6), np.arange(5)) % 4 == 1
+    infinite = np.where(is_forbidden, np.inf, cost)
+    with pytest.raises(
+        ValueError, match="cost must have finite numbers, got .* infinite"
+    ):
+        transport_plan(infinite, rows, columns, solver=solver)
+    sums = np.vstack([np.kron(np.eye(6), np.ones(5)), np.kron(np.ones(6), np.eye(5))])
+    bounds = [(0, 0) if one else (0, None) for one in is_forbidden.ravel()]
+    exact = linprog(cost.ravel(), A_eq=sums, b_eq=np.r_[rows, columns], bounds=bounds)
+    assert exact.status == 0
+    large = np.where(is_forbidden, 1e12, cost)
+    plan = transport_plan(large, rows, columns, solver=solver, regularisation=1e-3)
+    assert not plan.matrix[is_forbidden].any()
+    assert np.abs(plan.matrix.sum(axis=1) - rows).max() < 1e-12
+    slack = 1e-9 if solver == "network" else 1e-3 * np.log(30)
+    assert exact.fun - 1e-9 < plan.value < exact.fun + slack
+
+
+def test_a_soft_assignment_tends_to_the_assignment() -> None:
+    """pygmtools 100: similarities of rank one are far from an assignment, but for small ε.
+
+    The entropic plan costs at most ε (max c - min c) log(n m) more than the assignment.
+    """
+    features = np.arange(1.0, 26.0).reshape(5, 5)
+    order = [1, 0, 3, 2, 4]
+    similarity = features @ features[order].T
+    i, j = linear_sum_assignment(-similarity)
+    assert j.tolist() == order
+    best = -similarity[i, j].mean()
+    range_of_costs = np.ptp(similarity)
+    excess = []
+    for regularisation in (0.1, 0.01, 1e-3, 1e-4):
+        plan = transport_plan(
+            -similarity,
+            np.full(5, 0.2),
+            solver="entropic",
+            regularisation=regularisation,
+        )
+        assert np.abs(plan.matrix.sum(axis=0) - 0.2).max() < 1e-12
+        excess.append(plan.value - best)
+        assert -1e-9 < excess[-1] < regularisation * range_of_costs * np.log(25)
+    assert excess == sorted(excess, reverse=True)
+    assert 5 * plan.matrix[i, j].min() > 0.99
+    network = transport_plan(-similarity, np.full(5, 0.2))
+    assert np.array_equal(network.matrix.argmax(axis=1), j)
+    assert network.value == pytest.approx(best)

@@ -32,13 +32,15 @@ from distfilt.filters import GaussianFilter
 from distfilt.kalman import filterpy_ekf
 from distfilt.models import Model, constant_velocity, simulate
 from distfilt.sensors import Sensor, stack, wrap
+from tests.filters.families import still_model
 
 ANCHORS = np.array([(0.0, 0.0), (100.0, 0.0), (0.0, 100.0)])
 SATELLITE = np.array([2.0e7, 1.0e7])
 
 
 def _ranges(x: np.ndarray, dtype: type = np.float32) -> np.ndarray:
-    offset = np.asarray(x, dtype)[..., None, :2] - ANCHORS.astype(dtype)
+    places = np.asarray(x, dtype)[..., None, :2]
+    offset = places - ANCHORS.astype(dtype)
     return np.sqrt((offset**2).sum(axis=-1))
 
 
@@ -51,11 +53,8 @@ def _range_slopes(x: np.ndarray) -> np.ndarray:
 
 def _pseudorange(x: np.ndarray) -> np.ndarray:
     offset = x[..., :2] - SATELLITE
-    return np.sqrt((offset**2).sum(axis=-1, keepdims=True)) + x[..., 2:]
-
-
-def _still(dim: int) -> Model:
-    return Model(dim, lambda x, t, dt: x, lambda t, dt: np.zeros((dim, dim)))
+    distance = np.linalg.norm(offset, axis=-1, keepdims=True)
+    return distance + x[..., 2:]
 
 
 @pytest.mark.parametrize("deviation", [None, 3.0, 0.05, 1e-3])
@@ -63,9 +62,9 @@ def _still(dim: int) -> Model:
 def test_slopes_in_single_precision(deviation: float | None, factor: float) -> None:
     """Also where the values come in double precision after a change of units."""
     rng = np.random.default_rng(1)
-    x = np.concatenate(
-        [rng.uniform(-90, 90, (200, 2)), rng.standard_normal((200, 2))], axis=1
-    )
+    positions = rng.uniform(-90, 90, (200, 2))
+    velocities = rng.standard_normal((200, 2))
+    x = np.concatenate([positions, velocities], axis=1)
     scale = None if deviation is None else np.full(4, deviation)
     slope = central_difference(lambda s: factor * _ranges(s), x, scale=scale)
     error = np.abs(slope - factor * _range_slopes(x))
@@ -88,12 +87,17 @@ def test_an_exponential_in_single_precision() -> None:
     t = np.linspace(0.1, 3.0, 7)
 
     def decay(x: np.ndarray) -> np.ndarray:
-        a, b = x.astype(np.float32)[..., 0, None], x.astype(np.float32)[..., 1, None]
+        single = x.astype(np.float32)
+        a = single[..., 0, None]
+        b = single[..., 1, None]
         return a * np.exp(-b * t.astype(np.float32))
 
-    a, b = 2.5, 1.3
-    expected = np.stack([np.exp(-b * t), -a * t * np.exp(-b * t)], axis=-1)
-    slope = central_difference(decay, np.array([a, b]), scale=np.array([0.1, 0.1]))
+    a = 2.5
+    b = 1.3
+    decayed = np.exp(-b * t)
+    expected = np.stack([decayed, -a * t * decayed], axis=-1)
+    scale = np.array([0.1, 0.1])
+    slope = central_difference(decay, np.array([a, b]), scale=scale)
     assert np.abs(slope - expected).max() < 5e-4
 
 
@@ -118,12 +122,13 @@ def test_pseudorange_in_every_way_it_is_linearised() -> None:
     mean = prior @ h * (3e5 / innovation_var)
     std = np.sqrt(1e12 - 1e24 / innovation_var)
     for linearization in ("extended", "unscented"):
-        f = GaussianFilter(_still(3), [sensor], linearization=linearization)
-        state = f.step(f.start((np.zeros(3), prior)), 0.0, [y])
+        f = GaussianFilter(still_model(3), [sensor], linearization=linearization)
+        start = f.start((np.zeros(3), prior))
+        state = f.step(start, 0.0, [y])
         assert abs(state.means[0, 2] - mean[2]) < 0.1 * std
         assert state.covariances[0, 2, 2] ** 0.5 == pytest.approx(std, rel=1e-2)
     run = filterpy_ekf(
-        np.zeros(3), prior, y[None], model=_still(3), sensors=[sensor], times=[1.0]
+        np.zeros(3), prior, y[None], model=still_model(3), sensors=[sensor], times=[1.0]
     )
     assert abs(run.means[0, 2] - mean[2]) < 0.1 * std
     # Also within a stack, which has no standard deviations for its parts.
@@ -134,7 +139,7 @@ def test_pseudorange_in_every_way_it_is_linearised() -> None:
 def test_a_gate_lets_good_pseudoranges_pass() -> None:
     rng = np.random.default_rng(4)
     sensor = Sensor(1, _pseudorange, [[9.0]])
-    f = GaussianFilter(_still(3), [sensor], gate_probability=0.999)
+    f = GaussianFilter(still_model(3), [sensor], gate_probability=0.999)
     state = f.start((np.zeros(3), np.diag([1.0, 1.0, 1e12])))
     for _ in range(100):
         y = _pseudorange(np.array([0.0, 0.0, 3e5])) + 3 * rng.standard_normal(1)
@@ -195,7 +200,8 @@ def test_a_fast_phase_beside_a_steep_value_and_a_constant() -> None:
 
             x = np.array([[0.3], [5.3], [77.0]])
             slope = central_difference(function, x)
-            assert np.abs(slope[:, 0, 0] - k * np.cos(k * x[:, 0])).max() < 1e-3 * k
+            exact = k * np.cos(k * x[:, 0])
+            assert np.abs(slope[:, 0, 0] - exact).max() < 1e-3 * k
             assert np.abs(slope[:, 1, 0] - 1e6).max() < 1e-2
 
 
@@ -214,9 +220,10 @@ def test_a_phase_that_turns_many_times_within_the_usual_step() -> None:
     assert np.abs(slope - k).max() < 1e-3 * k
     # A filter hands its standard deviations over: 1/σ² = 1/P + k²/R.
     sensor = Sensor(1, phase, [[0.01]], residual_function=lambda a, b: wrap(a - b))
-    f = GaussianFilter(_still(1), [sensor])
+    f = GaussianFilter(still_model(1), [sensor])
     for place in x[:100]:
-        state = f.step(f.start((place, [[1e-4]])), 0.0, [phase(place)])
+        start = f.start((place, [[1e-4]]))
+        state = f.step(start, 0.0, [phase(place)])
         expected = 1 / (1e4 + k**2 / 0.01)
         assert state.covariances[0, 0, 0] == pytest.approx(expected, rel=5e-3)
 
@@ -296,14 +303,19 @@ def test_smooth_functions_keep_every_digit() -> None:
     x = rng.uniform(-20, 20, (50, 3))
 
     def lorenz(s: np.ndarray) -> np.ndarray:
-        a, b, c = s[..., 0], s[..., 1], s[..., 2]
-        return np.stack([10 * (b - a), a * (28 - c) - b, a * b - 8 / 3 * c], axis=-1)
+        a = s[..., 0]
+        b = s[..., 1]
+        c = s[..., 2]
+        rates = [10 * (b - a), a * (28 - c) - b, a * b - 8 / 3 * c]
+        return np.stack(rates, axis=-1)
 
     h = 6e-6 * np.maximum(1.0, np.abs(x))
     step = h[..., None] * np.eye(3)
-    ahead, behind = x[:, None] + step, x[:, None] - step
+    ahead = x[:, None] + step
+    behind = x[:, None] - step
     true = np.diagonal(ahead - behind, axis1=-2, axis2=-1)
-    plain = ((lorenz(ahead) - lorenz(behind)) / true[..., None]).mT
+    difference = lorenz(ahead) - lorenz(behind)
+    plain = (difference / true[..., None]).mT
     for deviation in (1e-3, 1.0, 20.0):
         slope = central_difference(lorenz, x, scale=np.full(3, deviation))
         assert (slope == plain).all()

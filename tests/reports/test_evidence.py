@@ -50,30 +50,35 @@ def joint_density(seen: np.ndarray, transition: np.ndarray, q: np.ndarray) -> fl
             covs[k, j] = transition @ covs[k - 1, j]
             covs[j, k] = covs[k, j].T
         covs[k, k] = transition @ covs[k - 1, k - 1] @ transition.T + q
-    cov = np.block([[covs[i, j] for j in range(1, n + 1)] for i in range(1, n + 1)])
+    blocks = []
+    for i in range(1, n + 1):
+        blocks.append([covs[i, j] for j in range(1, n + 1)])
+    cov = np.block(blocks)
     cov += np.kron(np.eye(n), NOISE)
     present = ~np.isnan(seen.ravel())
     flat = np.concatenate(mean[1:])[present]
-    return float(
-        multivariate_normal(flat, cov[np.ix_(present, present)]).logpdf(
-            seen.ravel()[present]
-        )
-    )
+    present_cov = cov[np.ix_(present, present)]
+    law = multivariate_normal(flat, present_cov)
+    return float(law.logpdf(seen.ravel()[present]))
 
 
 def nis_of_kalman(seen: np.ndarray) -> list[float]:
     """Return rᵀ S⁻¹ r of each step, by a plain Kalman filter."""
-    m, p = MEAN, COV
+    m = MEAN
+    p = COV
     result = []
     for y in seen:
-        m, p = F @ m, F @ p @ F.T + Q
-        h = np.eye(2)[~np.isnan(y)]
+        m = F @ m
+        p = F @ p @ F.T + Q
+        present = ~np.isnan(y)
+        h = np.eye(2)[present]
         if len(h):
             s = h @ (p + NOISE) @ h.T
-            r = y[~np.isnan(y)] - h @ m
+            r = y[present] - h @ m
             result.append(float(r @ np.linalg.inv(s) @ r))
             gain = p @ h.T @ np.linalg.inv(s)
-            m, p = m + gain @ r, p - gain @ h @ p
+            m = m + gain @ r
+            p = p - gain @ h @ p
         else:
             result.append(0.0)
     return result
@@ -102,10 +107,12 @@ def test_observations_that_come_late_have_the_same_evidence_in_sum() -> None:
     late = SEEN.copy()
     late[0] = np.nan
     delayed = [filters.Observation(1.0, 0, SEEN[0], arrival_time=4.0)]
-    run = f.run(f.start((MEAN, COV)), TIMES, [late], delayed=delayed)
+    start = f.start((MEAN, COV))
+    run = f.run(start, TIMES, [late], delayed=delayed)
     evidence = run["log_likelihood"].values
     assert np.isclose(evidence.sum(), joint_density(SEEN, F, Q), atol=1e-10)
-    assert evidence[0] == 0 and run["n_observed"].values[3, 0] == 2
+    assert evidence[0] == 0
+    assert run["n_observed"].values[3, 0] == 2
 
 
 @pytest.mark.parametrize("update", [enkf_exact, serially(enkf_exact)])
@@ -135,7 +142,8 @@ def test_the_evidence_of_particles_is_the_mean_of_the_likelihoods() -> None:
     f = filters.ParticleFilter(
         STILL, [BOTH], members=50, ess_threshold=0.0, record_evidence=True
     )
-    run = f.run(f.start(x, rng=np.random.default_rng(0)), TIMES, [SEEN])
+    start = f.start(x, rng=np.random.default_rng(0))
+    run = f.run(start, TIMES, [SEEN])
     density = np.ones(50)
     for y in SEEN:
         present = ~np.isnan(y)
@@ -161,8 +169,11 @@ def test_agents_of_a_transport_filter_share_the_evidence_of_all_observations() -
         members=30,
         record_evidence=True,
     )
-    state = f.step(f.start(x, rng=np.random.default_rng(0)), 0.0, [[0.3], [-0.2]])
-    density = norm(x[:, 0], 0.5).pdf(0.3) * norm(x[:, 1], 0.7).pdf(-0.2)
+    start = f.start(x, rng=np.random.default_rng(0))
+    state = f.step(start, 0.0, [[0.3], [-0.2]])
+    first = norm(x[:, 0], 0.5).pdf(0.3)
+    second = norm(x[:, 1], 0.7).pdf(-0.2)
+    density = first * second
     assert np.allclose(state.log_likelihood, np.log(density.mean()), atol=1e-10)
     assert state.n_observed.tolist() == [1, 1]
 
@@ -206,14 +217,17 @@ def test_consistent_filters_have_a_nis_of_the_number_of_observations(
     }[family]
     rng = np.random.default_rng(1)
     runs = (1000,)
-    truth = MEAN + rng.standard_normal((*runs, 2)) @ np.linalg.cholesky(COV).T
+    standard = rng.standard_normal((*runs, 2))
+    truth = MEAN + standard @ np.linalg.cholesky(COV).T
     seen = []
     for _ in range(2):
         truth = MOTION.sample_step(truth, 0.0, 1.0, rng=rng)
         seen.append(BOTH.observe(truth, rng=rng))
     f = make(MOTION, [BOTH], record_evidence=True)
-    run = f.run(f.start((MEAN, COV), rng=rng, runs=runs), [1.0, 2.0], [np.array(seen)])
-    assert abs(run["nis"].values.mean() - 2) < 4 * 2 / np.sqrt(2000) + 0.02
+    start = f.start((MEAN, COV), rng=rng, runs=runs)
+    run = f.run(start, [1.0, 2.0], [np.array(seen)])
+    standard_error = 2 / np.sqrt(2000)
+    assert abs(run["nis"].values.mean() - 2) < 4 * standard_error + 0.02
 
 
 def test_a_run_that_fails_has_no_evidence() -> None:
@@ -234,7 +248,8 @@ def test_saved_states_keep_the_scores(tmp_path: Any) -> None:
     state = f.step(f.start((MEAN, COV)), 1.0, [SEEN[0]])
     state.save(tmp_path / "state.npz")
     again = filters.GaussianState.load(tmp_path / "state.npz")
-    assert again.log_likelihood == state.log_likelihood and again.nis == state.nis
+    assert again.log_likelihood == state.log_likelihood
+    assert again.nis == state.nis
 
 
 def test_families_that_cannot_refuse_the_option_by_name() -> None:

@@ -44,9 +44,12 @@ PRIOR = (np.array([0.0, 0.0, 0.7]), np.diag([0.1, 0.1, 0.05]))
 
 def by_hand(heading: float, dt: float, u: np.ndarray) -> tuple[Any, Any]:
     """Return F and G of one piece."""
-    c, s = np.cos(heading), np.sin(heading)
-    f = np.array([[1, 0, -dt * u[0] * s], [0, 1, dt * u[0] * c], [0, 0, 1]])
-    return f, np.array([[dt * c, 0], [dt * s, 0], [0, dt]])
+    c = np.cos(heading)
+    s = np.sin(heading)
+    distance = dt * u[0]
+    f = np.array([[1, 0, -distance * s], [0, 1, distance * c], [0, 0, 1]])
+    g = np.array([[dt * c, 0], [dt * s, 0], [0, dt]])
+    return f, g
 
 
 @pytest.mark.parametrize("linearization", ["extended", "unscented"])
@@ -54,12 +57,12 @@ def test_the_noise_of_the_wheels_is_along_the_heading(linearization: Any) -> Non
     """With a sure prior the covariance is G Σ Gᵀ at the robot's own heading."""
     f = filters.GaussianFilter(ROBOT, [None], linearization=linearization)
     for heading in (0.0, 0.7, np.pi / 2):
-        state = f.step(f.start(([1.0, 2.0, heading], np.zeros((3, 3)))), 1.0, [None])
+        start = f.start(([1.0, 2.0, heading], np.zeros((3, 3))))
+        state = f.step(start, 1.0, [None])
         _, g = by_hand(heading, 1.0, np.array([1.0, 0.2]))
         assert np.allclose(state.covariances[0], g @ SIGMA @ g.T, atol=1e-9)
-        assert np.allclose(
-            state.means[0], [1 + np.cos(heading), 2 + np.sin(heading), heading + 0.2]
-        )
+        moved = [1 + np.cos(heading), 2 + np.sin(heading), heading + 0.2]
+        assert np.allclose(state.means[0], moved)
 
 
 def test_steps_across_inputs_use_each_for_its_time() -> None:
@@ -75,9 +78,13 @@ def test_steps_across_inputs_use_each_for_its_time() -> None:
     assert np.allclose(ROBOT.step([1.0, -1.0, 0.3], 0.5, 1.25), x)
     assert np.allclose(ROBOT.noise_at([1.0, -1.0, 0.3], 0.5, 1.25), cov, atol=1e-9)
     # At the edges: up to an input's time it does not hold yet, and the last holds on.
-    assert [u.tolist() for _, _, u in ODOMETRY.pieces(0.0, 1.0)] == [[1.0, 0.2]]
-    assert [u.tolist() for _, _, u in ODOMETRY.pieces(1.0, 1.0)] == [[2.0, -0.1]]
-    assert [u.tolist() for _, _, u in ODOMETRY.pieces(9.0, 5.0)] == [[0.5, 0.0]]
+    for start, length, values in (
+        (0.0, 1.0, [1.0, 0.2]),
+        (1.0, 1.0, [2.0, -0.1]),
+        (9.0, 5.0, [0.5, 0.0]),
+    ):
+        ((_, _, u),) = ODOMETRY.pieces(start, length)
+        assert u.tolist() == values
 
 
 FAMILIES = {
@@ -104,7 +111,8 @@ def test_all_agents_of_a_transport_filter_draw_the_same() -> None:
     f = filters.TransportFilter(
         ROBOT, [component([0], std=1.0)] * 2, [(0, 1)], members=10
     )
-    state = f.step(f.start(PRIOR, rng=np.random.default_rng(0)), 1.0, [None, None])
+    start = f.start(PRIOR, rng=np.random.default_rng(0))
+    state = f.step(start, 1.0, [None, None])
     assert (state.belief[0] == state.belief[1]).all()
 
 

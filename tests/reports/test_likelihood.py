@@ -7,12 +7,14 @@
 | own | noise that grows with the distance | posterior of a grid |
 | own | a count beside a Gaussian sensor, sent to a neighbour | weights by hand |
 | own | such a sensor in a Kalman filter | refused by name |
+| own | the nis of a sensor without moments | unknown (NaN), and its numbers count |
 
 Posteriors are integrals on a fine grid; weights are products of densities of scipy.
 """
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 from typing import Any
 
@@ -45,7 +47,8 @@ def log_student(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def log_radar(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return norm.logpdf((y - x)[..., 0], scale=0.2 + 0.3 * np.abs(x[..., 0]))
+    scale = 0.2 + 0.3 * np.abs(x[..., 0])
+    return norm.logpdf((y - x)[..., 0], scale=scale)
 
 
 COUNTER = LikelihoodSensor(
@@ -68,11 +71,13 @@ def grid_moments(log_density: Any, seen: list[float]) -> tuple[float, float]:
     """Return mean and variance of the posterior with the prior N(1, 1), by a sum on a grid."""
     logs = norm.logpdf(GRID, 1.0, 1.0)
     for y in seen:
-        logs = logs + log_density(GRID[:, None], np.full((GRID.size, 1), y))
+        observed = np.full((GRID.size, 1), y)
+        logs = logs + log_density(GRID[:, None], observed)
     w = np.exp(logs - logs.max())
     w /= w.sum()
     mean = float(w @ GRID)
-    return mean, float(w @ (GRID - mean) ** 2)
+    variance = float(w @ (GRID - mean) ** 2)
+    return mean, variance
 
 
 FAMILIES = {
@@ -93,8 +98,10 @@ def test_the_posterior_is_that_of_a_grid(family: str, case: str) -> None:
     run = f.run(start, [1.0, 2.0, 3.0], [np.array(seen)[:, None]])
     mean, variance = grid_moments(log_density, seen)
     slack = 1.0 if family.startswith("particle") else 3.0
-    assert abs(run["mean"].values[-1, 0, 0] - mean) < 0.03 * slack
-    assert abs(run["variance"].values[-1, 0, 0] / variance - 1) < 0.1 * slack
+    last_mean = run["mean"].values[-1, 0, 0]
+    last_variance = run["variance"].values[-1, 0, 0]
+    assert abs(last_mean - mean) < 0.03 * slack
+    assert abs(last_variance / variance - 1) < 0.1 * slack
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -111,6 +118,62 @@ def test_a_late_count_is_that_of_its_own_time(family: str) -> None:
     mean, variance = grid_moments(log_count, [6.0])
     assert abs(after.mean[0, 0] - 2 * mean) < 0.15
     assert abs(after.variance[0, 0] / (4 * variance) - 1) < 0.3
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_nis_is_unknown_without_moments_and_its_numbers_count(family: str) -> None:
+    """NaN in steps that have such an observation, the Gaussian sensor's where it is alone.
+
+    Two members at -1 and 1 predict 0 ± 1 (transport: a variance of 2, with N - 1), so that an
+    observation of 1.5 has r = 1.5 and S = 1 + 0.25.
+    """
+    position = component([0], std=0.5)
+    f = FAMILIES[family](
+        STILL,
+        [[position, STUDENT], [STUDENT]],
+        graphs.path(2),
+        members=2,
+        record_evidence=True,
+    )
+    members = np.array([[-1.0], [1.0]])
+    start = f.start(members, rng=np.random.default_rng(0))
+    pair = [Observation(0.0, 0, [1.5]), Observation(0.0, 0, [0.2], 1)]
+    both = [pair, [Observation(0.0, 1, [0.3])]]
+    alone = [pair[:1], None]
+    shares = family != "transport"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", filters.ParticleCollapse)
+        state = f.step(start, 0.0, both)
+        plain = f.step(start, 0.0, alone)
+    # Particle filters share observations, transport filters do not.
+    assert state.n_observed.tolist() == ([3, 3] if shares else [2, 1])
+    assert np.isnan(state.nis).all()
+    assert np.isfinite(state.log_likelihood).all()
+    assert plain.n_observed.tolist() == ([1, 1] if shares else [1, 0])
+    expected = 1.5**2 / ((1.0 if shares else 2.0) + 0.25)
+    assert np.allclose(plain.nis, [expected, expected if shares else 0.0])
+    # A missing observation of such a sensor is none.
+    gone = [[pair[0], Observation(0.0, 0, [np.nan], 1)], None]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", filters.ParticleCollapse)
+        state = f.step(start, 0.0, gone)
+    assert np.allclose(state.nis, plain.nis)
+    assert state.n_observed.tolist() == plain.n_observed.tolist()
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_nis_of_runs_in_which_different_observations_are_missing(
+    family: str,
+) -> None:
+    f = FAMILIES[family](
+        STILL, [[component([0], std=0.5), RADAR]], members=60, record_evidence=True
+    )
+    y = np.array([[0.1], [0.2], [np.nan]])
+    z = np.array([[0.3], [np.nan], [0.4]])
+    start = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0), runs=(3,))
+    state = f.step(start, 0.0, [[Observation(0.0, 0, y), Observation(0.0, 0, z, 1)]])
+    assert state.n_observed[:, 0].tolist() == [2, 1, 1]
+    assert np.isnan(state.nis[:, 0]).tolist() == [True, False, True]
 
 
 def test_weights_are_products_of_densities() -> None:
@@ -160,7 +223,8 @@ def test_the_gate_has_the_spread_of_the_rates_and_of_the_counts() -> None:
                 gate_probability=0.95,
                 record_evidence=True,
             )
-            after = f.step(f.start(x, rng=np.random.default_rng(0)), 0.0, [[y]])
+            start = f.start(x, rng=np.random.default_rng(0))
+            after = f.step(start, 0.0, [[y]])
             assert after.rejected.tolist() == [rejected]
             nis = 0.0 if rejected else (y - rates.mean()) ** 2 / spread
             assert np.allclose(after.nis, nis)
@@ -184,7 +248,8 @@ def test_particles_that_make_a_count_impossible_lose_their_weight() -> None:
 
     f = ParticleFilter(STILL, [LikelihoodSensor(1, log_positive)], members=4)
     x = np.array([[-1.0], [1.0], [-2.0], [2.0]])
-    state = f.step(f.start(x, rng=np.random.default_rng(0)), 0.0, [[1.0]])
+    start = f.start(x, rng=np.random.default_rng(0))
+    state = f.step(start, 0.0, [[1.0]])
     assert np.allclose(state.weights, [[0, 0.5, 0, 0.5]])
     with pytest.raises(filters.FilterError, match="likelihood of zero"):
         f.step(f.start(-abs(x), rng=np.random.default_rng(0)), 0.0, [[1.0]])
@@ -237,5 +302,6 @@ def test_what_it_cannot_do_is_refused_by_name() -> None:
 
 def test_draws_and_predictions_are_its_own() -> None:
     drawn = COUNTER.observe(np.full((20_000, 1), 1.0), rng=np.random.default_rng(0))
-    assert abs(drawn.mean() - np.e) < 0.05 and abs(drawn.var() - np.e) < 0.15
+    assert abs(drawn.mean() - np.e) < 0.05
+    assert abs(drawn.var() - np.e) < 0.15
     assert np.allclose(COUNTER.predict([[0.0], [1.0]]), [[1.0], [np.e]])

@@ -21,10 +21,10 @@ import pytest
 
 from distfilt import updates
 from distfilt.filters import EnsembleFilter
-from distfilt.models import Model
 from distfilt.network import Faults, graphs
 from distfilt.sensors import component
 from distfilt.updates.wrappers import gaspari_cohn
+from tests.filters.families import still_model
 
 ETKF = partial(updates.etkf, rotation="none")
 """An update that draws nothing."""
@@ -113,7 +113,13 @@ def test_a_missing_one_of_correlated_observations_is_left_out() -> None:
     local = updates.with_localization(
         ETKF, places=places, observation_places=places, radius=1.0
     )
-    y = np.array([[1.0, 2.0], [np.nan, 2.0], [np.nan, np.nan]])
+    y = np.array(
+        [
+            [1.0, 2.0],
+            [np.nan, 2.0],
+            [np.nan, np.nan],
+        ]
+    )
     after = updates.with_missing(local, x, x, y, r, rng=np.random.default_rng(0))
     single = updates.with_localization(
         ETKF, places=places, observation_places=places[1:], radius=1.0
@@ -123,6 +129,27 @@ def test_a_missing_one_of_correlated_observations_is_left_out() -> None:
     assert (after[2] == x[2]).all()
     joint = local(x[0], x[0], y[0], r, rng=np.random.default_rng(0))
     assert np.allclose(after[0], joint, atol=1e-12)
+
+
+@pytest.mark.parametrize("missing", [0, 1, 2])
+def test_of_three_correlated_observations_one_may_be_missing(missing: int) -> None:
+    """It is as if the sensor had the other two alone, with their own correlation."""
+    x = draw(1, 10, 3)
+    places = np.array([[0.0], [0.8], [1.5]])
+    r = np.array([[1.0, 0.6, 0.3], [0.6, 1.5, 0.7], [0.3, 0.7, 2.0]])
+    y = np.array([1.0, 2.0, -1.0])
+    rest = np.delete(np.arange(3), missing)
+    y[missing] = np.nan
+    local = updates.with_localization(
+        ETKF, places=places, observation_places=places, radius=1.0
+    )
+    after = updates.with_missing(local, x, x, y, r, rng=np.random.default_rng(0))
+    without = updates.with_localization(
+        ETKF, places=places, observation_places=places[rest], radius=1.0
+    )
+    r_rest = r[np.ix_(rest, rest)]
+    expected = without(x, x[:, rest], y[rest], r_rest, rng=np.random.default_rng(0))
+    assert np.allclose(after, expected, atol=1e-12)
 
 
 def test_each_axis_has_its_period() -> None:
@@ -150,7 +177,7 @@ def test_each_axis_has_its_period() -> None:
         )
 
 
-STILL = Model(4, lambda x, t, dt: x, lambda t, dt: np.zeros((4, 4)))
+STILL = still_model(4)
 SENSORS = [component([k], std=1.0) for k in range(4)]
 PLACES = 10.0 * np.arange(4.0)[:, None]
 
@@ -179,13 +206,21 @@ def test_places_of_sensors_on_a_ring(by_function: bool) -> None:
     state = f.start((np.zeros(4), np.eye(4)), rng=np.random.default_rng(0))
     after = f.step(state, 0.0, [[3.0], [np.nan], [1.0], [2.0]])
     y = np.array([3.0, 0.0, 1.0, 2.0])
-    receives = np.array([[1, 0, 0, 1], [1, 0, 1, 0], [0, 0, 1, 1], [1, 0, 1, 1]])
+    receives = np.array(
+        [
+            [1, 0, 0, 1],
+            [1, 0, 1, 0],
+            [0, 0, 1, 1],
+            [1, 0, 1, 1],
+        ]
+    )
     for agent in range(4):
         x = state.ensembles[agent]
         mean = x.mean(axis=0)
         variance = x.var(axis=0, ddof=1)
         # Far components are independent: the scalar Kalman filter for each.
-        expected = mean + receives[agent] * variance / (variance + 1) * (y - mean)
+        gain = variance / (variance + 1)
+        expected = mean + receives[agent] * gain * (y - mean)
         assert np.allclose(after.ensembles[agent].mean(axis=0), expected, atol=1e-12)
 
 
@@ -205,7 +240,8 @@ def test_lost_observations_keep_the_places_of_the_others() -> None:
     y = np.array([3.0, 2.0, 1.0, 2.0])
     mean = state.ensembles.mean(axis=-2)
     variance = state.ensembles.var(axis=-2, ddof=1)
-    expected = mean + changed * variance / (variance + 1) * (y - mean)
+    gain = variance / (variance + 1)
+    expected = mean + changed * gain * (y - mean)
     assert np.allclose(after.ensembles.mean(axis=-2), expected, atol=1e-12)
 
 

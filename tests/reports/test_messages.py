@@ -31,6 +31,7 @@ from distfilt.filters import (
 from distfilt.gaussians import log_density
 from distfilt.kalman import kalman_filter
 from distfilt.models import LinearModel, Model, constant_velocity
+from distfilt.network import graphs
 from distfilt.sensors import Sensor, bearing, component
 from distfilt.updates import resample
 
@@ -138,6 +139,20 @@ def test_a_log_without_an_event_of_a_mixture() -> None:
     f = MixtureFilter(WALK, [EYE], target_dim=1)
     run = f.run(f.start(PRIOR), None, [])
     assert run["mean"].shape == (0, 1, 2)
+
+
+@pytest.mark.parametrize("make", [GaussianFilter, ParticleFilter])
+def test_times_without_an_event_are_a_run_of_forecasts(make: Any) -> None:
+    f = make(WALK, [EYE, EYE], graphs.path(2))
+    start = f.start(PRIOR, rng=np.random.default_rng(0))
+    times = [1.0, 2.5]
+    run = f.run(start, times, [])
+    as_arrays = f.run(start, times, [None, None])
+    assert run["time"].values.tolist() == times
+    assert (run["mean"].values == as_arrays["mean"].values).all()
+    assert (run["covariance"].values == as_arrays["covariance"].values).all()
+    with pytest.raises(ValueError, match="entry for each of 2 agents, got 1 entries"):
+        f.run(start, times, [None])
 
 
 def test_noise_that_is_drawn_inside() -> None:

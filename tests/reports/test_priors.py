@@ -43,7 +43,8 @@ def test_agents_start_from_their_own_gaussians(
     run = f.run(f.start(GAUSSIANS, runs=runs), [1.0, 2.0], SEEN)
     for k, prior in enumerate(GAUSSIANS):
         one = make(MOTION, EYES[:1])
-        alone = one.run(one.start(prior, runs=runs), [1.0, 2.0], [SEEN[k]])
+        start = one.start(prior, runs=runs)
+        alone = one.run(start, [1.0, 2.0], [SEEN[k]])
         assert np.allclose(run["mean"].isel(agent=k), alone["mean"].isel(agent=0))
         assert np.allclose(
             run["variance"].isel(agent=k), alone["variance"].isel(agent=0)

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 
 from distfilt.filters import EnsembleFilter
-from distfilt.models import Model
 from distfilt.sensors import Sensor
 from distfilt.updates import update, with_missing
 from distfilt.updates.decorator import _EVENTS, _PARAMETERS, RowGenerator
+from tests.filters.families import still_model
 
 LEAD = (2, 3)
 ROWS = np.array([1, 4, 5])
@@ -145,7 +145,7 @@ def test_runs_of_a_filter_have_their_own_draws(name: str, stacks: bool) -> None:
     def shift(x: Any, h: Any, y: Any, r: Any, *, rng: Any) -> Any:
         return x + DRAWS[name](rng, x.shape)
 
-    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    still = still_model(1)
     sensor = Sensor(2, lambda x: np.concatenate([x, x], axis=-1), np.eye(2))
     f = EnsembleFilter(
         still, [sensor], update=update(shift) if stacks else shift, members=20

@@ -34,7 +34,7 @@ from distfilt.filters import (
     TransportFilter,
 )
 from distfilt.kalman import QuaternionChart, mekf
-from distfilt.models import Model, constant_velocity, satellite_pose, simulate
+from distfilt.models import constant_velocity, satellite_pose, simulate
 from distfilt.network import graphs
 from distfilt.sensors import (
     Sensor,
@@ -46,6 +46,7 @@ from distfilt.sensors import (
     stack,
 )
 from distfilt.updates import effective_size
+from tests.filters.families import still_model
 
 WALK = constant_velocity(sigma=0.3, axes=1)
 EYE = component([0], std=0.5)
@@ -91,7 +92,8 @@ def test_the_same_observation_twice(family: str, copied: Any, way: str) -> None:
     expected = assimilate([one])
     with pytest.warns(RuntimeWarning, match=TWICE) as caught:
         found = assimilate([one, copied(one)])
-    assert len(caught) == 1 and (found == expected).all()
+    assert len(caught) == 1
+    assert (found == expected).all()
 
 
 @EACH
@@ -232,7 +234,7 @@ def test_logarithms_of_any_normalisation_are_not_doubted(logs: Any) -> None:
 # Degrees for radians -----------------------------------------------------------------------
 
 
-STILL = Model(2, lambda x, t, dt: x, lambda t, dt: 0.01 * dt * np.eye(2))
+STILL = still_model(2, rate=0.01)
 ANGLES = {
     "bearing": (bearing([0, 1], std=0.05), [60.0]),
     "line": (line_angle([0, 1], std=0.05), [89.6]),

@@ -14,13 +14,14 @@ import pytest
 from distfilt import coupling, density, network
 from distfilt.filters import DensityFilter, MixtureFilter, TransportFilter
 from distfilt.mixtures import jeffreys_of_many
-from distfilt.models import Model, Swarm
+from distfilt.models import Swarm
 from distfilt.network import Channel, graphs
 from distfilt.sensors import Sensor, bearing, component, stack
 from distfilt.updates import enkf, principal_components, with_localization
 from distfilt.updates.wrappers import gaspari_cohn
+from tests.filters.families import still_model
 
-STILL = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+STILL = still_model(1)
 
 
 def test_the_peclet_number_of_a_face_has_the_diffusion_of_the_face() -> None:
@@ -31,10 +32,13 @@ def test_the_peclet_number_of_a_face_has_the_diffusion_of_the_face() -> None:
     width = 1 / 5
     for k in range(4):
         # The cells (k, 0) and (k + 1, 0): their centres and the face between them.
-        lower, upper = (grid.centres[4 * (k + j)][0] for j in (0, 1))
+        lower = grid.centres[4 * k][0]
+        upper = grid.centres[4 * (k + 1)][0]
         z = 0.3 * width / (0.02 + 0.1 * (lower + upper) / 2)
-        forwards = -z / np.expm1(-z) * (0.02 + 0.1 * lower) / width**2
-        backwards = z / np.expm1(z) * (0.02 + 0.1 * upper) / width**2
+        lower_diffusion = 0.02 + 0.1 * lower
+        upper_diffusion = 0.02 + 0.1 * upper
+        forwards = -z / np.expm1(-z) * lower_diffusion / width**2
+        backwards = z / np.expm1(z) * upper_diffusion / width**2
         assert np.isclose(rates[4 * (k + 1), 4 * k], forwards, rtol=1e-12)
         assert np.isclose(rates[4 * k, 4 * (k + 1)], backwards, rtol=1e-12)
 
@@ -78,7 +82,7 @@ def test_a_density_filter_starts_with_gaussians_of_its_width() -> None:
 
 def test_transport_with_correction_has_the_weighted_covariance() -> None:
     """Without it the transported members have less, with N in the denominator of both."""
-    walk = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
+    walk = still_model(2)
     sensor = component([0], std=0.5)
     x = np.random.default_rng(0).standard_normal((30, 2))
     logs = -0.5 * ((x[:, 0] - 0.7) / 0.5) ** 2
@@ -88,7 +92,8 @@ def test_transport_with_correction_has_the_weighted_covariance() -> None:
     close = []
     for correct in (True, False):
         f = TransportFilter(walk, [sensor], members=30, correct=correct)
-        after = f.step(f.start(x, rng=np.random.default_rng(1)), 0.0, [[0.7]])
+        start = f.start(x, rng=np.random.default_rng(1))
+        after = f.step(start, 0.0, [[0.7]])
         members = after.ensembles[0]
         assert np.allclose(members.mean(axis=0), w @ x, atol=1e-12)
         close.append(np.allclose(np.cov(members.T, bias=True), weighted, atol=1e-9))
@@ -208,9 +213,11 @@ def test_the_ends_of_the_trapezoid_rule_count_half(d: int) -> None:
         return float(values)
 
     logs = [points @ slope for slope in slopes]
-    logs = [log - np.log(integrate(np.exp(log))) for log in logs]
+    masses = [integrate(np.exp(log)) for log in logs]
+    logs = [log - np.log(mass) for log, mass in zip(logs, masses, strict=True)]
     p, q = (np.exp(log) for log in logs)
-    expected = 0.5 * integrate((p - q) * (logs[0] - logs[1]))
+    log_ratio = logs[0] - logs[1]
+    expected = 0.5 * integrate((p - q) * log_ratio)
     functions = [partial(np.dot, b=slope) for slope in slopes]
     (result,) = jeffreys_of_many(
         functions[0], functions[1:], np.zeros(d), np.ones(d), nodes=nodes

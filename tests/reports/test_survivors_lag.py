@@ -26,9 +26,10 @@ from distfilt.network import graphs
 from distfilt.sensors import Sensor, component, wrap
 from distfilt.updates import etkf, with_localization
 from distfilt.updates.wrappers import gaspari_cohn
+from tests.filters.families import still_model
 
 TURN = 2 * np.pi
-STILL = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+STILL = still_model(1)
 PAST_FILTERS = {
     "gaussian": partial(
         GaussianFilter, fusion=partial(network.covariance_intersection, rule="equal")
@@ -50,8 +51,10 @@ def test_the_past_of_fused_headings_turns_with_them(family: str) -> None:
     f: Any = PAST_FILTERS[family](walk, [None, None], graphs.path(2), lag=1)
     pasts = []
     for centre in (0.5, np.pi):
-        prior = [(wrap([centre + side]), [[0.04]]) for side in (-0.1, 0.1)]
-        state = f.step(f.start(prior, rng=np.random.default_rng(0)), 1.0, [None, None])
+        means = [wrap([centre - 0.1]), wrap([centre + 0.1])]
+        prior = [(mean, [[0.04]]) for mean in means]
+        start = f.start(prior, rng=np.random.default_rng(0))
+        state = f.step(start, 1.0, [None, None])
         (past,) = state.lagged_states
         pasts.append(wrap(f.summarize(past).mean[:, 0] - centre))
     # m_past⁺ = m_past + G Δm with G = P / (P + Q) = 1/2 and Δm = ± 0.1
@@ -63,7 +66,7 @@ def test_the_past_of_fused_headings_turns_with_them(family: str) -> None:
 
 def test_a_step_of_no_length_separates_no_copies_of_a_model_with_noise() -> None:
     """Q = dt is zero there, but the next step has noise: the copies remain copies."""
-    walk = Model(1, lambda x, t, dt: x, lambda t, dt: dt * np.eye(1))
+    walk = still_model(1, rate=1.0)
     f = ParticleFilter(walk, [component([0], std=0.5)], members=200, ess_threshold=0.9)
     rng = np.random.default_rng(0)
     start = f.start(([0.0], [[1.0]]), rng=rng)
@@ -82,7 +85,8 @@ def test_cross_validation_leaves_out_whole_places() -> None:
     """∫p̂² - (2/N) Σᵢ p̂₋ᵢ(Xᵢ), where p̂₋ᵢ is the mean over the agents in other places than i."""
     rng = np.random.default_rng(2)
     grid = density.Grid((400,))
-    x = np.repeat(0.2 + 0.6 * rng.random((6, 1)), [12, 12, 1, 1, 1, 1], axis=0)
+    places = 0.2 + 0.6 * rng.random((6, 1))
+    x = np.repeat(places, [12, 12, 1, 1, 1, 1], axis=0)
     n = len(x)
     silverman = x.std() * (4 / (3 * n)) ** 0.2
     widths = silverman * np.geomspace(0.15, 1.5, 20)
@@ -91,7 +95,8 @@ def test_cross_validation_leaves_out_whole_places() -> None:
         z = density.kernels(x, grid, bandwidth=h)
         score = float(grid.integral(z.mean(axis=0) ** 2))
         for i, cell in enumerate(grid.cell_index(x)):
-            score -= 2 / n * z[x[:, 0] != x[i, 0], cell].mean()
+            is_elsewhere = x[:, 0] != x[i, 0]
+            score -= 2 / n * z[is_elsewhere, cell].mean()
         scores.append(score)
     # Means over N - 1 instead would choose a wider kernel.
     chosen = density.bandwidth(x, grid, rule="least_squares")
@@ -100,31 +105,39 @@ def test_cross_validation_leaves_out_whole_places() -> None:
 
 def test_the_taper_between_correlated_observations_is_theirs() -> None:
     """Observations at 3 and 4, components at 0 and 2.5: whitened, each is used in turn by hand."""
-    places, seen_at = np.array([[0.0], [2.5]]), np.array([[3.0], [4.0]])
+    places = np.array([[0.0], [2.5]])
+    seen_at = np.array([[3.0], [4.0]])
     rng = np.random.default_rng(0)
     x = rng.standard_normal((12, 2))
-    h = x @ [[0.5, 1.0], [1.0, -0.5]] + 0.3 * rng.standard_normal((12, 2))
-    y, noise = np.array([1.0, -2.0]), np.array([[0.5, 0.3], [0.3, 0.8]])
+    linear = x @ [[0.5, 1.0], [1.0, -0.5]]
+    h = linear + 0.3 * rng.standard_normal((12, 2))
+    y = np.array([1.0, -2.0])
+    noise = np.array([[0.5, 0.3], [0.3, 0.8]])
     local = with_localization(
         partial(etkf, rotation="none"),
         places=places,
         observation_places=seen_at,
         radius=2.0,
     )
-    rho = gaspari_cohn(np.abs(np.concatenate([places, seen_at]) - seen_at.T) / 2.0)
+    all_places = np.concatenate([places, seen_at])
+    distances = np.abs(all_places - seen_at.T)
+    rho = gaspari_cohn(distances / 2.0)
     joint = np.concatenate([x, h], axis=1)
     # W R Wᵀ = I: the observations W y are independent.
     whitening = np.linalg.inv(np.linalg.cholesky(noise))
     for w, target in zip(whitening, whitening @ y, strict=True):
         deviations = joint - joint.mean(axis=0)
         # c = (ρ ∘ C) w and the mixture's variance s = wᵀ (ρ ∘ C)_hh w, of components (x, h)
-        c = rho * (deviations.T @ deviations[:, 2:] / 11) @ w
+        cov = deviations.T @ deviations[:, 2:] / 11
+        c = rho * cov @ w
         s = w @ c[2:]
         z = deviations[:, 2:] @ w
         z *= np.sqrt(s / z.var(ddof=1))
         # m⁺ = m + c (y - wᵀ h) / (s + 1), and z⁺ = z / √(s + 1) about it
         innovation = target - w @ joint[:, 2:].mean(axis=0)
-        moves = innovation / (s + 1) + (1 / np.sqrt(s + 1) - 1) * z / s
+        shift = innovation / (s + 1)
+        shrinkage = (1 / np.sqrt(s + 1) - 1) * z / s
+        moves = shift + shrinkage
         joint = joint + moves[:, None] * c
     after = local(x, h, y, noise, rng=rng)
     assert np.allclose(after, joint[:, :2], rtol=0, atol=1e-10)
@@ -143,9 +156,8 @@ def test_the_gate_of_a_sum_of_one_component_is_that_of_a_gaussian() -> None:
     # The chi-squared quantile 6.635 bounds r² / (3 + 0.1): |r| < 4.535, and 2.70 by slope alone.
     for r, rejected in ((4.5, 0), (4.57, 1), (3.0, 0)):
         seen = [[1.25 + r]]
-        mixture = one.step(
-            one.start(GaussianMixture.gaussian([0.5], [[1.0]])), 0.0, seen
-        )
+        prior = GaussianMixture.gaussian([0.5], [[1.0]])
+        mixture = one.step(one.start(prior), 0.0, seen)
         gaussian = plain.step(plain.start(([0.5], [[1.0]])), 0.0, seen)
         assert mixture.rejected[0] == gaussian.rejected[0] == rejected
         assert np.allclose(mixture.means, gaussian.means, rtol=1e-12)
@@ -165,12 +177,18 @@ def test_the_consensus_on_headings_is_the_central_filter(average: Any) -> None:
         fusion=network.finite_time_consensus,
         average=average,
     )
-    p, r, y = 0.5, 0.25, np.array([3.0, 0.2 - np.pi])
-    state = f.step(f.start([([m], [[p]]) for m in (3.1, -3.1)]), 0.0, y[:, None])
+    p = 0.5
+    r = 0.25
+    y = np.array([3.0, 0.2 - np.pi])
+    start = f.start([([m], [[p]]) for m in (3.1, -3.1)])
+    state = f.step(start, 0.0, y[:, None])
     # From π, the first prior is at -0.0416 and the second at 0.0416; the averages have 0.
     priors = np.array([3.1 - np.pi, np.pi - 3.1])
     priors = priors if average == "measurements" else np.zeros(2)
     # m⁺ = (m / P + Σ y / R) / (1 / P + 2 / R)
-    expected = (priors / p + wrap(y - np.pi).sum() / r) / (1 / p + 2 / r)
-    assert np.allclose(wrap(state.means[:, 0] - np.pi), expected, rtol=0, atol=1e-9)
-    assert np.allclose(state.covariances, 1 / (1 / p + 2 / r), rtol=1e-9)
+    information = 1 / p + 2 / r
+    observed = wrap(y - np.pi).sum()
+    expected = (priors / p + observed / r) / information
+    found = wrap(state.means[:, 0] - np.pi)
+    assert np.allclose(found, expected, rtol=0, atol=1e-9)
+    assert np.allclose(state.covariances, 1 / information, rtol=1e-9)

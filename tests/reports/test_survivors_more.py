@@ -25,7 +25,8 @@ def still(d: int) -> Model:
 def assert_covariance(x: np.ndarray, cov: np.ndarray) -> None:
     """Within four standard errors: Var S_ij = (C_ii C_jj + C_ij²) / N for N Gaussian draws."""
     variances = np.diagonal(cov)
-    error = np.sqrt((np.outer(variances, variances) + cov**2) / len(x))
+    products = np.outer(variances, variances)
+    error = np.sqrt((products + cov**2) / len(x))
     assert (np.abs(np.cov(x.T) - cov) < 4 * error).all()
 
 
@@ -44,7 +45,8 @@ def test_a_wide_belief_that_turns_by_half_a_period_stays_whole() -> None:
     )
     x = np.linspace(-2.5, 2.5, 41)[:, None]
     f = EnsembleFilter(model, [component([0], std=1.0)], members=41)
-    after = f.step(f.start(x, rng=np.random.default_rng(0)), 1.0, [None]).belief[0]
+    start = f.start(x, rng=np.random.default_rng(0))
+    after = f.step(start, 1.0, [None]).belief[0]
     turns = (after - run_on(x)) / (2 * np.pi)
     assert np.allclose(turns, np.round(turns[0]), atol=1e-9)
 
@@ -87,7 +89,8 @@ def test_members_are_reset_with_a_correlated_covariance() -> None:
     x = f.reset(start, [1, 2], [5.0, -3.0], CORRELATED).belief[0]
     assert_covariance(x[:, 1:], CORRELATED)
     error = np.sqrt(np.diagonal(CORRELATED) / len(x))
-    assert (np.abs(x[:, 1:].mean(axis=0) - [5.0, -3.0]) < 4 * error).all()
+    difference = x[:, 1:].mean(axis=0) - [5.0, -3.0]
+    assert (np.abs(difference) < 4 * error).all()
 
 
 def test_a_scalar_distribution_is_a_prior_with_its_variance() -> None:
@@ -103,12 +106,19 @@ def test_a_likelihood_is_asked_for_observations_with_one_component() -> None:
 
     def log_normal(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         # Σ_k -(y_k - x_k)²/2 - log(2π)/2 over the components that are there.
-        return np.nansum(-0.5 * (y - x) ** 2 - 0.5 * np.log(2 * np.pi), axis=-1)
+        terms = -0.5 * (y - x) ** 2 - 0.5 * np.log(2 * np.pi)
+        return np.nansum(terms, axis=-1)
 
     sensor = LikelihoodSensor(2, log_normal)
-    observed = [[1.0, 2.0], [np.nan, 2.0], [1.0, np.nan], [np.nan, np.nan]]
+    observed = [
+        [1.0, 2.0],
+        [np.nan, 2.0],
+        [1.0, np.nan],
+        [np.nan, np.nan],
+    ]
     logs = sensor.evaluate(np.tile([0.5, -1.0], (4, 1)), observed)
-    first, second = norm.logpdf(1.0, 0.5), norm.logpdf(2.0, -1.0)
+    first = norm.logpdf(1.0, 0.5)
+    second = norm.logpdf(2.0, -1.0)
     assert np.allclose(logs, [first + second, second, first, 0.0])
 
 

@@ -6,6 +6,10 @@ Report                              Situation
 POMDPPlanners pull 238              a field of view: NaN beyond the range, unscented filter
 edpl-ompl issue 54                  on top of a landmark the likelihood is NaN
 dust issue 178                      an observation that no particle can explain
+Gen.jl issue 117                    weights of minus infinity, time after time
+multicalc-rust issue 205            a weight that falls to zero, and evidence for it later
+particles issue 42                  either of two components is missing at each time
+ardupilot issue 19825               a direction divided by a range of zero
 own                                 a radar whose prior mean is its own place, extended filter
 own                                 a target at the edge of the range, in every family
 own                                 one of two components cannot be seen by some particles
@@ -22,6 +26,7 @@ import pytest
 
 from distfilt.filters import (
     EnsembleFilter,
+    FilterError,
     GaussianFilter,
     MixtureFilter,
     Observation,
@@ -30,10 +35,18 @@ from distfilt.filters import (
 )
 from distfilt.kalman import QuaternionChart, mekf
 from distfilt.models import Model, constant_velocity, satellite_pose
-from distfilt.sensors import Sensor, bearing, component, distance, range_bearing
-from distfilt.updates.particles import log_likelihood, reweight
+from distfilt.sensors import (
+    LikelihoodSensor,
+    Sensor,
+    bearing,
+    component,
+    distance,
+    range_bearing,
+)
+from distfilt.updates.particles import ParticleCollapse, log_likelihood, reweight
+from tests.filters.families import still_model
 
-WALK = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[0.01 * dt]]))
+WALK = still_model(1, rate=0.01)
 RADAR = Sensor(1, lambda x: np.where(np.abs(x) < 5, x, np.nan), [[0.04]])
 PRIOR = ([4.0], [[4.0]])
 MESSAGE = "observations must be predicted to be used"
@@ -45,10 +58,13 @@ def truncated() -> tuple[float, float]:
     """The posterior on a grid: states out of range contradict each observation."""
     x = np.linspace(-12.0, 20.0, 6401)
     density = np.exp(-0.5 * (x - 4) ** 2 / 4)
-    step = np.exp(-0.5 * (np.arange(-200, 201) * 0.005) ** 2 / 0.01)
+    offsets = np.arange(-200, 201) * 0.005
+    step = np.exp(-0.5 * offsets**2 / 0.01)
     for y in Y[:, 0]:
         density = np.convolve(density, step / step.sum(), mode="same")
-        density = density * np.exp(-0.5 * (y - x) ** 2 / 0.04) * (np.abs(x) < 5)
+        likelihood = np.exp(-0.5 * (y - x) ** 2 / 0.04)
+        is_in_range = np.abs(x) < 5
+        density = density * likelihood * is_in_range
         density /= density.sum()
     mean = density @ x
     return mean, density @ (x - mean) ** 2
@@ -59,8 +75,10 @@ def test_particles_that_cannot_see_contradict() -> None:
     with warnings.catch_warnings(action="error"):
         run = f.run(f.start(PRIOR, rng=np.random.default_rng(0)), TIMES, [Y])
     mean, variance = truncated()
-    assert run["mean"].values[-1, 0, 0] == pytest.approx(mean, abs=0.01)
-    assert run["variance"].values[-1, 0, 0] == pytest.approx(variance, rel=0.1)
+    last_mean = run["mean"].values[-1, 0, 0]
+    last_variance = run["variance"].values[-1, 0, 0]
+    assert last_mean == pytest.approx(mean, abs=0.01)
+    assert last_variance == pytest.approx(variance, rel=0.1)
     assert not run["unseen"].values.any()
 
 
@@ -137,10 +155,12 @@ def test_a_radar_that_starts_on_its_target_counts_thirty() -> None:
     cov = np.diag([9.0, 9.0, 0.01, 0.01])
     with pytest.warns(RuntimeWarning, match="singular point") as caught:
         run = f.run(f.start((np.zeros(4), cov)), times, [y])
-    assert len(caught) == 1 and run["unseen"].values.sum() == 30
+    assert len(caught) == 1
+    assert run["unseen"].values.sum() == 30
     with warnings.catch_warnings(action="error"):
         run = f.run(f.start(([0.01, 0, 0, 0], cov)), times, [y])
-    assert np.abs(run["mean"].values[-1, 0, :2] - [3, 4]).max() < 0.5
+    error = run["mean"].values[-1, 0, :2] - [3, 4]
+    assert np.abs(error).max() < 0.5
 
 
 def test_particles_of_two_components_and_none_that_sees() -> None:
@@ -149,14 +169,14 @@ def test_particles_of_two_components_and_none_that_sees() -> None:
     logs = np.log(np.full(3, 1 / 3))
     y = np.array([0.4, 0.3])
     weights = np.exp(reweight(logs, predicted, y, np.eye(2)))
-    exact = np.exp(-0.5 * ((y - predicted[1:]) ** 2).sum(axis=-1))
+    squares = (y - predicted[1:]) ** 2
+    exact = np.exp(-0.5 * squares.sum(axis=-1))
     assert weights[0] == 0
     assert np.allclose(weights[1:], exact / exact.sum())
     nobody = predicted * [1, np.nan]
-    assert np.allclose(
-        reweight(logs, nobody, y, np.eye(2)),
-        reweight(logs, predicted[:, :1], y[:1], np.eye(1)),
-    )
+    blind = reweight(logs, nobody, y, np.eye(2))
+    alone = reweight(logs, predicted[:, :1], y[:1], np.eye(1))
+    assert np.allclose(blind, alone)
     # Updates of ensembles leave it out for all, as documented.
     assert np.isfinite(log_likelihood(predicted, y, np.eye(2))).all()
     f = ParticleFilter(WALK, [Sensor(1, lambda x: x * np.nan, [[1.0]])], members=100)
@@ -174,7 +194,8 @@ def test_the_gate_of_particles_looks_through_those_that_see() -> None:
 
 def test_a_mixture_contradicts_by_component() -> None:
     f = MixtureFilter(WALK, [RADAR], target_dim=1)
-    state = f.step(f.start(([0.0], [[0.1]])), 1.0, [[0.3]])
+    start = f.start(([0.0], [[0.1]]))
+    state = f.step(start, 1.0, [[0.3]])
     # P = 0.11 and R = 0.04
     assert state.mixtures[0].means[0, 0] == pytest.approx(0.3 * 0.11 / 0.15)
 
@@ -199,3 +220,96 @@ def test_a_correct_run_is_not_bothered() -> None:
     with warnings.catch_warnings(action="error"):
         run = f.run(f.start(([1.0], [[0.1]])), None, [Observation(1.0, 0, [1.0], 1)])
     assert run["unseen"].values.tolist() == [[0.0]]
+
+
+def log_within(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A uniform error of at most 1: minus infinity outside."""
+    with np.errstate(divide="ignore"):
+        return np.log(0.5 * (np.abs(y - x)[..., 0] <= 1))
+
+
+def test_weights_of_minus_infinity_time_after_time() -> None:
+    """Gen.jl issue 117: what one observation excludes stays excluded, and no weight is NaN.
+
+    Uniform errors leave the interval that all observations have in common. One that excludes all
+    that is left contradicts the model, which is an error that says so.
+    """
+    x = np.linspace(0.0, 5.0, 501)[:, None]
+    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    ruler = LikelihoodSensor(1, log_within)
+    f = ParticleFilter(still, [ruler], members=501, ess_threshold=0.0, jitter=0.0)
+    state = f.start(x, rng=np.random.default_rng(0))
+    for t, y in enumerate((2.0, 2.8, 1.5), start=1):
+        state = f.step(state, float(t), [[y]])
+    left = (x[:, 0] >= 1.8 - 1e-9) & (x[:, 0] <= 2.5 + 1e-9)
+    assert np.allclose(state.weights[0], left / left.sum(), atol=1e-12)
+    with pytest.raises(FilterError, match="every particle has a likelihood of zero"):
+        f.step(state, 4.0, [[9.0]])
+
+
+def test_a_weight_that_falls_to_zero_comes_back() -> None:
+    """multicalc-rust issue 205: after 4 000 in the exponent, and as much evidence for it."""
+    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    x = np.array([[0.0], [1.0], [40.0]])
+    f = ParticleFilter(
+        still, [component([0], std=0.5)], members=3, ess_threshold=0.0, jitter=0.0
+    )
+    state = f.start(x, rng=np.random.default_rng(0))
+    seen = [0.2, 0.4, 40.1, 39.0, 30.0]
+    for t, y in enumerate(seen, start=1):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ParticleCollapse)
+            state = f.step(state, float(t), [[y]])
+        logs = np.array([-2 * sum((y - p) ** 2 for y in seen[:t]) for p in x[:, 0]])
+        weights = np.exp(logs - logs.max())
+        assert np.allclose(state.weights[0], weights / weights.sum(), atol=1e-12)
+        if t == 2:
+            assert state.weights[0, 2] == 0.0
+    assert state.weights[0, 2] > 0.999
+
+
+def test_either_component_is_missing_at_each_time() -> None:
+    """particles issue 42: weights are products of the densities of those that are there."""
+    still = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
+    noise = np.array([[0.5, 0.3], [0.3, 0.4]])
+    both = Sensor(2, lambda x: x, noise)
+    x = np.random.default_rng(0).standard_normal((50, 2))
+    f = ParticleFilter(still, [both], members=50, ess_threshold=0.0, jitter=0.0)
+    state = f.start(x, rng=np.random.default_rng(0))
+    logs = np.zeros(50)
+    series = [[0.3, np.nan], [np.nan, -0.2], [0.1, 0.4], [np.nan, np.nan]]
+    for t, y in enumerate(series, start=1):
+        state = f.step(state, float(t), [y])
+        kept = np.flatnonzero(~np.isnan(y))
+        if len(kept):
+            r = np.array(y)[kept] - x[:, kept]
+            inverse = np.linalg.inv(noise[np.ix_(kept, kept)])
+            logs = logs - 0.5 * np.einsum("ni,ij,nj->n", r, inverse, r)
+        weights = np.exp(logs - logs.max())
+        assert np.allclose(state.weights[0], weights / weights.sum(), atol=1e-12)
+
+
+@pytest.mark.parametrize("linearization", ["extended", "unscented"])
+def test_a_direction_at_a_range_of_zero(linearization: Any) -> None:
+    """ardupilot issue 19825: x / r at r = 0 is NaN, and the covariance stays what it was."""
+
+    def look(x: np.ndarray) -> np.ndarray:
+        r = np.linalg.norm(x, axis=-1, keepdims=True)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return x[..., :1] / r
+
+    flow = Sensor(1, look, [[0.01]])
+    still = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
+    f = GaussianFilter(still, [flow], linearization=linearization)
+    cov = np.diag([0.5, 0.3])
+    with pytest.warns(RuntimeWarning, match=MESSAGE):
+        state = f.step(f.start(([0.0, 0.0], cov)), 0.0, [[0.4]])
+    assert state.unseen.tolist() == [1.0]
+    assert np.allclose(state.covariances[0], cov)
+    assert np.allclose(state.means[0], 0.0)
+    # Away from there it is used: H = (y², -x y) / r³.
+    mean = np.array([3.0, 4.0])
+    used = f.step(f.start((mean, 1e-4 * cov)), 1.0, [[0.7]])
+    h = np.array([16.0, -12.0]) / 125
+    gain = 1e-4 * cov @ h / (h @ (1e-4 * cov) @ h + 0.01)
+    assert np.allclose(used.means[0], mean + gain * (0.7 - 0.6), atol=1e-7)

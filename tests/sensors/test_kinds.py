@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -286,3 +287,71 @@ def test_a_hidden_direction_is_nan() -> None:
         predicted = angles_only(std=1e-4, hidden=hidden).predict(x)
         assert np.isnan(predicted).tolist() == [[True, True], [False, False]]
         assert np.array_equal(predicted[1], plain[1])
+
+
+# A robot at (1, 2) with heading 0.5, and a landmark at (4, 6): 5 m away.
+ROBOT_AND_LANDMARK = np.array([4.0, 6.0, 0.5, 1.0, 2.0])
+LANDMARK_BEARING = np.arctan2(4.0, 3.0) - 0.5
+
+
+@pytest.mark.parametrize(
+    "sensor, value",
+    [
+        (distance([0, 1], std=1.0, observer=[3, 4]), [5.0]),
+        (bearing([0, 1], std=1.0, observer=[3, 4]), [np.arctan2(4.0, 3.0)]),
+        (bearing([0, 1], std=1.0, observer=[3, 4, 2]), [LANDMARK_BEARING]),
+        (
+            range_bearing([0, 1], std=(1.0, 1.0), observer=[3, 4, 2]),
+            [5.0, LANDMARK_BEARING],
+        ),
+        (
+            range_bearing([0, 1], std=(1.0, 1.0), observer=[3, 4]),
+            [5.0, np.arctan2(4.0, 3.0)],
+        ),
+    ],
+)
+def test_a_sensor_on_a_body_of_the_state(sensor: Sensor, value: list[float]) -> None:
+    """Values by hand; the derivative is that of the prediction, also by the sensor's own pose."""
+    states = np.stack([ROBOT_AND_LANDMARK, ROBOT_AND_LANDMARK + [1.0, 0, 0, 1.0, 0]])
+    assert np.allclose(sensor.predict(states), value, atol=1e-14)
+    h = 1e-6
+    shifted = states[:, None] + h * np.eye(5)
+    forward = sensor.predict(shifted)
+    backward = sensor.predict(states[:, None] - h * np.eye(5))
+    slope = (forward - backward).mT / (2 * h)
+    assert np.allclose(sensor.jacobian(states), slope, atol=1e-8)
+
+
+def test_a_sensor_on_a_body_sees_nothing_at_its_own_place() -> None:
+    camera = range_bearing([0, 1], std=(1.0, 1.0), observer=[3, 4, 2])
+    x = np.array([1.0, 2.0, 0.5, 1.0, 2.0])
+    assert camera.predict(x)[0] == 0.0 and np.isnan(camera.predict(x)[1])
+    assert np.isnan(camera.jacobian(x)[1, 2])
+    # The bearing wraps with the heading.
+    x = np.array([0.0, 2.0, -3.0, 1.0, 2.0])
+    assert np.allclose(camera.predict(x), [1.0, np.pi + 3.0 - 2 * np.pi])
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"observer": [2], "std": 1.0}, "observer must have 2 components, got 1"),
+        ({"observer": [2, 3, 4], "std": 1.0}, "observer must have 2 .* got 3"),
+        ({"observer": [1, 2], "std": 1.0}, "other components than indices"),
+        ({"observer": [2, 3], "origin": [0.0, 0.0], "std": 1.0}, "origin must be None"),
+    ],
+)
+def test_an_observer_that_does_not_fit_is_refused(
+    options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        distance([0, 1], **options)
+    with pytest.raises(ValueError, match="heading must be 0"):
+        range_bearing([0, 1], std=(1.0, 1.0), heading=1.0, observer=[2, 3])
+
+
+def test_of_a_range_and_a_bearing_the_bearing_wraps() -> None:
+    """Ranges that differ by more than a turn's 2π stay as they are."""
+    sensor = sensors.range_bearing([0, 1], std=(0.1, 0.1))
+    residual = sensor.residual(np.array([10.0, 3.0]), np.array([1.0, -3.0]))
+    assert np.allclose(residual, [9.0, 6.0 - 2 * np.pi])

@@ -149,7 +149,8 @@ def _features(s: SeparableMap, v: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
     for centre, width in s.steps[:, k].T:
         u = (own_values - centre) / width
         # ∫ exp(-½ u²) = √(2 π) σ Φ(u)
-        integrals.append(np.sqrt(2 * np.pi) * width * norm.cdf(u))
+        scale = np.sqrt(2 * np.pi) * width
+        integrals.append(scale * norm.cdf(u))
         derivatives.append(np.exp(-0.5 * u**2))
     ones = np.ones(len(v))
     earlier = np.column_stack([ones, *v[:, used].T, *bumps])
@@ -176,7 +177,13 @@ def _map_by_hand() -> tuple[SeparableMap, np.ndarray]:
     std = np.array([2.0, 0.5, 1.5])
     uses = [[0], [0, 1]]
     s = SeparableMap(1, centre, std, bumps, steps, uses, weights, slopes)
-    points = np.array([[1.2, -0.7, 2.6], [-3.0, -1.4, 0.5], [0.5, -1.0, 5.0]])
+    points = np.array(
+        [
+            [1.2, -0.7, 2.6],
+            [-3.0, -1.4, 0.5],
+            [0.5, -1.0, 5.0],
+        ]
+    )
     return s, points
 
 
@@ -240,13 +247,15 @@ def test_bumps_are_placed_at_quantiles() -> None:
     joint = (joint - joint.mean(axis=0)) / joint.std(axis=0)
     for variable in range(3):
         # Two bumps: centres at 2/6 and 4/6, widths from 1/6 to 3/6 and from 3/6 to 5/6.
-        quantile = np.quantile(joint[:, variable], np.arange(1, 6) / 6)
+        levels = np.arange(1, 6) / 6
+        quantile = np.quantile(joint[:, variable], levels)
         centres, widths = s.bumps[:, variable]
         assert np.allclose(centres, quantile[[1, 3]])
         assert np.allclose(widths, quantile[[2, 4]] - quantile[[0, 2]])
     for k in range(2):
         # Three steps at 2/8, 4/8 and 6/8 of the state's variables
-        quantile = np.quantile(joint[:, 1 + k], np.arange(1, 8) / 8)
+        levels = np.arange(1, 8) / 8
+        quantile = np.quantile(joint[:, 1 + k], levels)
         centres, widths = s.steps[:, k]
         assert np.allclose(centres, quantile[[1, 3, 5]])
         assert np.allclose(widths, quantile[[2, 4, 6]] - quantile[[0, 2, 4]])

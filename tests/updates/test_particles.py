@@ -77,7 +77,8 @@ def test_weights_by_bayes_rule_with_a_missing_component() -> None:
     assert np.allclose(weights[sees], full[sees] / full[sees].sum())
     # A component that no particle can predict is missing.
     h[:, 1] = np.nan
-    marginal = _normalise(prior - 0.5 * innovation[:, 0] ** 2 / noise[0, 0])
+    squares = innovation[:, 0] ** 2 / noise[0, 0]
+    marginal = _normalise(prior - 0.5 * squares)
     assert np.allclose(np.exp(reweight(prior, h, y, noise)), marginal)
 
 

@@ -373,3 +373,24 @@ def test_distances_on_a_ring_are_the_shorter_way_round(
     rho = gaspari_cohn(np.array(ratios))
     change = ETKF(*data, rng=rng()) - x
     assert np.allclose(analysis - x, rho * change, atol=1e-12)
+
+
+def test_places_whole_turns_apart_are_one_place() -> None:
+    """Longitudes of 350° and -10°, and of 730° and 10°, beside a latitude without a period."""
+    x = members(20)
+    data = (x, x @ H.T, Y, R)
+    places = np.array([[350.0, 3.0], [10.0, -2.0], [60.0, 0.0]])
+    observed = np.array([[20.0, 1.0], [320.0, 0.0]])
+    turns = 360.0 * np.array([[-1.0, 0.0], [2.0, 0.0], [0.0, 0.0]])
+    results = []
+    for shift, back in ((0 * turns, 0.0), (turns, 0.0), (turns, -720.0)):
+        local = updates.with_localization(
+            ETKF,
+            places=places + shift,
+            observation_places=observed + [back, 0.0],
+            radius=40.0,
+            period=[360.0, np.nan],
+        )
+        results.append(local(*data, rng=rng()))
+    assert np.allclose(results[1], results[0], rtol=0, atol=1e-9)
+    assert np.allclose(results[2], results[0], rtol=0, atol=1e-9)

@@ -1,0 +1,183 @@
+"""Robots that measure distances to each other: what they send against what they gain.
+
+The sets are generated in the form of range-aided mapping problems, with slipping wheels,
+scaled odometry, constant errors of radios, echoes and gaps. All rows have the same data.
+"""
+
+from __future__ import annotations
+
+import runpy
+import tempfile
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from bookkit import datasets
+from distfilt import filters, mixtures, network
+from distfilt.models import Model
+from distfilt.sensors import Sensor
+
+NAME = "radios"
+PAPER = "together"
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "radios.py"
+names = runpy.run_path(str(EXAMPLE))
+# Without the interpreter's own names, which do not travel to other processes
+example = {name: names[name] for name in names if not name.startswith("__")}
+
+DURATION = 60.0
+# Standard deviation of a radio's constant error, and of a range if it is estimated
+BIAS_STD = 0.2
+RANGE_STD_WITH_BIAS = 0.12
+GATE = 0.999
+# Scores are averaged from here on, in s.
+AFTER = 10.0
+ROWS = (
+    "none",
+    "naive",
+    "intersection",
+    "increments",
+    "all",
+    "partial",
+    "all_biases",
+)
+# Which rows estimate the constant errors of radios: how many of them an agent holds
+BIASES = {"partial": 1, "all_biases": 4}
+
+
+def read_set(seed: np.random.Generator) -> datasets.Dataset:
+    """Generate a set, and read it from its file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "radios.pyfg"
+        datasets.write_pyfg(path, rng=seed, duration=DURATION)
+        return datasets.read_pyfg(path)
+
+
+def add_biases(model: Model, n: int) -> Model:
+    """Return the model with `n` constants behind its state."""
+
+    def move(x, t, dt):
+        poses = model.step(x[..., : model.dim], t, dt)
+        return np.concatenate([poses, x[..., model.dim :]], axis=-1)
+
+    def noise_cov(t, dt):
+        return block_diag(model.Q(t, dt), np.zeros((n, n)))
+
+    periods = {k: 2 * np.pi for k in range(2, model.dim, 3)}
+    return Model(model.dim + n, move, noise_cov, periods=periods)
+
+
+def add_bias(observation, dim, component, std):
+    """Return a range whose sensor adds a component of the state, with another noise."""
+    plain = observation.sensor
+    variance = plain.noise_cov - example["RANGE_STD"] ** 2 + std**2
+
+    def h(x):
+        return plain.predict(x[..., :dim]) + x[..., [component]]
+
+    return observation.replace(sensor=Sensor(1, h, variance, kind="range"))
+
+
+def make_filter(row: str, model: Model, n: int) -> filters.Filter:
+    """Return the filter of a row for n robots, all of which hear each other."""
+    graph = network.graphs.complete(n)
+    none = [None] * n
+    gate = {"gate_probability": GATE}
+    if row in ("all", "all_biases"):
+        return filters.GaussianFilter(model, none, graph, **gate)
+    if row == "increments":
+        return filters.InformationIncrementFilter(
+            model, none, graph, target_dim=3 * n, **gate
+        )
+    if row == "partial":
+        fuse = partial(
+            mixtures.target_fusion, target_dim=3 * n, fuse=mixtures.fuse_moments
+        )
+        single = {"n_components": 1, "max_components": 1}
+        return filters.MixtureFilter(
+            model, none, graph, target_dim=3 * n, fusion=fuse, **single, **gate
+        )
+    rule = {
+        "none": None,
+        "naive": network.naive_fusion,
+        "intersection": network.covariance_intersection,
+    }[row]
+    return filters.GaussianFilter(
+        model, none, graph, share_observations=False, fusion=rule, **gate
+    )
+
+
+def run_row(data: datasets.Dataset, row: str):
+    """Return the record of one filter on one set."""
+    n = len(data.robots)
+    n_biases = BIASES.get(row, 0)
+    model = example["make_model"](data)
+    observations = example["list_ranges"](data)
+    mean, cov = data.prior_poses()
+    if n_biases:
+        dim = model.dim
+        model = add_biases(model, n_biases)
+        observations = [
+            add_bias(
+                o, dim, dim + (o.agent if n_biases == n else 0), RANGE_STD_WITH_BIAS
+            )
+            for o in observations
+        ]
+        mean = np.append(mean, np.zeros(n_biases))
+        cov = block_diag(cov, BIAS_STD**2 * np.eye(n_biases))
+    f = make_filter(row, model, n)
+    truth = {str(k): partial(true_component, data, k) for k in range(3 * n)}
+    start = f.start((mean, cov))
+    return f.run(start, None, observations, truth=truth)
+
+
+def true_component(data: datasets.Dataset, k: int, t: float) -> float:
+    """Return one component of all robots' true poses."""
+    return float(data.true_state(t)[k])
+
+
+def score(run, n: int) -> dict[str, float]:
+    """Return the error of positions, NEES a component, rejections and numbers sent."""
+    late = run.sel(time=slice(AFTER, None))
+    squared = late["squared_error"].values[..., : 3 * n]
+    squared = squared.reshape(*squared.shape[:-1], n, 3)[..., :2]
+    return {
+        "rmse": float(np.sqrt(2 * squared.mean())),
+        "nees": float(late["nees"].mean()) / (3 * n),
+        "rejected": float(run["rejected"].sum()) / float(run.sizes["agent"]),
+        "scalars": float(run["scalars"].sum()) / DURATION / n,
+    }
+
+
+def trial(seed: np.random.SeedSequence) -> dict[str, float]:
+    """Scores of all rows on one generated set."""
+    import warnings
+
+    data = read_set(np.random.default_rng(seed))
+    values = {}
+    for row in ROWS:
+        with warnings.catch_warnings():
+            # Rows that lose their target warn; their scores say it too.
+            warnings.simplefilter("ignore", RuntimeWarning)
+            run = run_row(data, row)
+        scores = score(run, len(data.robots))
+        values |= {f"{row}_{name}": value for name, value in scores.items()}
+    return {name: float(f"{value:.6g}") for name, value in values.items()}
+
+
+METRICS = ("rmse", "nees", "rejected", "scalars")
+columns = [f"{row}_{metric}" for row in ROWS for metric in METRICS]
+parameters = {
+    "duration": DURATION,
+    "after": AFTER,
+    "gate": GATE,
+    "step_std": example["STEP_STD"],
+    "range_std": example["RANGE_STD"],
+    "range_std_with_bias": RANGE_STD_WITH_BIAS,
+    "bias_std": BIAS_STD,
+}
+code = [read_set, add_biases, add_bias, make_filter, run_row, true_component, score]
+seeds = np.random.SeedSequence(1401).spawn(16)
+rtol = 1e-3
