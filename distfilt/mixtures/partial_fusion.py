@@ -12,7 +12,6 @@ equations (14)-(15) of Semeraro, LeGrand and Kulik for one other agent.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import Annotated, Literal
@@ -21,7 +20,7 @@ import numpy as np
 from scipy.linalg import svdvals
 
 from ..gaussians.single import unscented_points
-from ..linalg import SolverError, cholesky, log_sum_exp, solve_lower, symmetrise
+from ..linalg import SolverError, log_sum_exp, symmetrise
 from ..validation import (
     Array,
     ArrayInput,
@@ -361,12 +360,12 @@ def _fuse_components(
         vectors = vectors + (precisions @ differences[..., None])[:, None, :, 0]
 
     # P_tt = S (I + Sᵀ Λ S)⁻¹ Sᵀ with the prior's own P_tt = S Sᵀ.
-    root = cholesky(prior.covs[q, :n, :n])[:, None]
+    root = np.linalg.cholesky(prior.covs[q, :n, :n])[:, None]
     relative = np.eye(n) + root.mT @ symmetrise(information) @ root
     is_matched = (q == p) & (len(divided.means) == prior.n_components)
     smallest_pivot = np.where(is_matched, _MATCHED_PIVOT, _UNMATCHED_PIVOT)
     lower, is_definite = _factor_definite(relative, smallest_pivot[:, None])
-    half = solve_lower(lower, root.mT)
+    half = np.linalg.solve(lower, np.broadcast_to(root.mT, lower.shape))
     target = half.mT @ half
 
     # The target moves by P_tt η, and e by the gain times that.
@@ -388,14 +387,6 @@ def _fuse_components(
 def _factor_definite(matrices: Array, smallest_pivot: Array) -> tuple[Array, Mask]:
     """Cholesky factors of a stack, and which of them exist; the identity where none does."""
     d = matrices.shape[-1]
-    variances = np.diagonal(matrices, axis1=-2, axis2=-1)
-    limits = smallest_pivot[..., None] * np.abs(variances)
-    # Mostly all factors exist, with pivots L_kk² that are no rounding.
-    with suppress(np.linalg.LinAlgError):
-        lower = cholesky(matrices)
-        pivots = np.diagonal(lower, axis1=-2, axis2=-1) ** 2
-        if (pivots > limits).all():
-            return lower, np.ones(matrices.shape[:-2], dtype=bool)
     lower = np.zeros_like(matrices)
     is_definite = np.ones(matrices.shape[:-2], dtype=bool)
     for k in range(d):
@@ -404,7 +395,7 @@ def _factor_definite(matrices: Array, smallest_pivot: Array) -> tuple[Array, Mas
         column = matrices[..., k:, k] - product[..., 0]
         pivot = column[..., 0]
         # A pivot that has lost so many digits to cancellation is rounding.
-        is_definite &= pivot > limits[..., k]
+        is_definite &= pivot > smallest_pivot * np.abs(matrices[..., k, k])
         # A matrix that has failed is carried along with harmless numbers.
         root = np.sqrt(np.where(is_definite, pivot, 1.0))
         column = np.where(is_definite[..., None], column, 0.0)
