@@ -1,6 +1,6 @@
 """Filters by events and by arrays against plain numpy that gives the same numbers.
 
-Each plain filter is what a user would write for its problem: arrays, a loop, the
+Each plain filter is one that a user would write for its problem: arrays, a loop, the
 equations of one step. Ours gets the same sensors and times, and records everything that
 it records by default. Times are of the processor, in turns; a row misses where the two
 differ by more than 1e-9 or ours takes longer than its limit allows.
@@ -314,7 +314,7 @@ def sight_slope(x: np.ndarray, robot: int, landmark: int) -> np.ndarray:
 
 
 def sight(x: np.ndarray, robot: int, landmark: int) -> Moments:
-    """Return what a robot sees of a landmark, and its derivative."""
+    """Return a robot's observation of a landmark, and its derivative."""
     return sight_of(x, robot, landmark), sight_slope(x, robot, landmark)
 
 

@@ -146,7 +146,7 @@ def set_width(driver: Any, width: int) -> None:
 
 
 def check_access(driver: Any, page: Path) -> dict[tuple[int, str], list[str]]:
-    """Return what breaks a rule of access, for each width and theme."""
+    """Return the violations of rules of access, for each width and theme."""
     driver.get("about:blank")
     found = {}
     for width in SIZES:
@@ -155,7 +155,7 @@ def check_access(driver: Any, page: Path) -> dict[tuple[int, str], list[str]]:
         if not found:
             driver.get(page.as_uri())
             driver.execute_async_script(READY)
-        # Scripts of the page mark what scrolls, 300 ms after a change.
+        # Scripts of the page mark scrolling parts, 300 ms after a change.
         time.sleep(0.6)
         for theme in THEMES:
             found[width, theme] = find_violations(driver, theme)

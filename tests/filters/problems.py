@@ -248,7 +248,7 @@ MEMBERS = 60
 
 @dataclass(frozen=True)
 class Case:
-    """A filter with some options, and what its family can do."""
+    """A filter with some options, and the abilities of its family."""
 
     make: Callable[..., Any]
     options: dict[str, Any]

@@ -1,4 +1,4 @@
-"""What no change of names may change: of runs, agents, components, units and calls.
+"""Results do not depend on names: of runs, agents, components, units and calls.
 
 Every family runs on one problem without symmetries. Source: own.
 """
@@ -41,14 +41,14 @@ def test_every_run_of_a_batch_is_that_run_alone(name: str) -> None:
     for run in range(2):
         alone = record(case, one_run(problem, run))
         assert_equal(batch.isel(run=run), alone)
-        # What is sent does not depend on the values, but on what is missing in all runs.
+        # Messages do not depend on the values, but on the entries that all runs miss.
         assert np.array_equal(batch["messages"], alone["messages"])
 
 
 @ignore_collapse
 @pytest.mark.parametrize("name", [n for n, case in CASES.items() if case.runs])
 def test_a_batch_loses_the_messages_of_its_runs(name: str) -> None:
-    """The first run of a batch loses what a run alone loses, and the second other messages."""
+    """The first run of a batch loses the messages that a run alone loses, and the second others."""
     case = CASES[name]
     if case.prior == "common members":
         pytest.skip("members in common need every message")

@@ -42,7 +42,7 @@ def test_noise_is_checked_without_a_factor() -> None:
         (np.ones((3, 3)), False),
         # A covariance with a component that has no variance.
         (np.array([[1.0, 0.1, 0.0], [0.1, 0.0, 0.0], [0.0, 0.0, 1.0]]), True),
-        # Diagonal, but for what stands beside the diagonal.
+        # Diagonal, but for the entries beside the diagonal.
         (np.array([[1.0, 2.0], [2.0, 1.0]]), True),
         (np.array([[1.0, 0.0], [1.0, 1.0]]), True),
         # Indefinite beside a constant.

@@ -1,4 +1,4 @@
-"""A table of checks shows what was found, fails in the tests, and says "changed" to a reader."""
+"""A table of checks shows the values found, fails in the tests, and says "changed" to a reader."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs in the published formats: what is read is what was written, and errors name the line."""
+"""Logs in the published formats: reading inverts writing, and errors name the line."""
 
 from __future__ import annotations
 

@@ -429,7 +429,7 @@ def test_fusion_on_a_tree_creates_no_information() -> None:
     """Σ Y_i - Σ Y_link over agents and links is constant, also where one message is lost."""
     n_links = TREE.senders.size
     means, covs = gaussians(1, *RUNS, 5, d=3)
-    # What links share is common to both ends, and less than both know.
+    # The common information of a link is the same at both ends, and less than both know.
     common = np.broadcast_to(500.0 * np.eye(3), (*RUNS, n_links, 3, 3)).copy()
     common_means = np.zeros((*RUNS, n_links, 3))
     common_means[...] = [0.3, -0.2, 0.5]
@@ -542,7 +542,7 @@ def test_the_residuals_of_admm_are_in_the_units_of_the_penalty() -> None:
 def test_a_flood_sends_back_nothing_where_it_is_told(
     graph: Graph, split_horizon: bool
 ) -> None:
-    """Messages of a flood by sets: each agent forwards what is new to it."""
+    """Messages of a flood by sets: each agent forwards new messages."""
     n = graph.n_agents
     channel = Channel(graph)
     values = rng(1).standard_normal((n, 2))

@@ -247,7 +247,7 @@ def test_members_of_a_team_have_the_moments_of_its_robots_alone(family: str) -> 
 
 
 def test_robots_whose_states_are_the_same_target_share_and_fuse() -> None:
-    """Two agents assume different process noises of one target, and share what they see."""
+    """Two agents assume different process noises of one target, and share their observations."""
     walks = [
         LinearModel.from_transition(
             1, lambda dt: np.eye(1), lambda t, dt, q=q: q * dt * np.eye(1)
@@ -298,7 +298,7 @@ def test_simulations_and_derivatives_are_those_of_each(logs: str) -> None:
 
 
 class Echo(Model):
-    """A model whose derivative is what it is told of the deviations."""
+    """A model whose derivative is the deviations that it is given."""
 
     def jacobian(
         self, x: Any, t: float, dt: float, *, std: np.ndarray | None = None

@@ -307,7 +307,7 @@ def test_half_of_the_messages_are_lost(family: str) -> None:
 
 @EACH
 def test_a_change_that_is_not_there_moves_no_reference(family: str) -> None:
-    """ros2_controllers pull 1854: what is not there does not move the reference.
+    """ros2_controllers pull 1854: a missing value does not move the reference.
 
     An odometer that gives NaN while it is read too early; the next has the whole change. The
     beacon between them is used.

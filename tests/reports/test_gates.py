@@ -149,7 +149,7 @@ def test_each_run_and_each_agent_counts_for_itself() -> None:
 def test_good_observations_of_others_do_not_hide_a_bad_source(
     lag: int, comes_along: bool
 ) -> None:
-    """Two agents with one kind of sensor share what they see: agent 1's is always far off.
+    """Two agents with one kind of sensor share their observations: agent 1's is always far off.
 
     The numbers of the two alternate in every agent's list, so that counted together each good one
     would end the streak. With a lag every observation of agent 1 comes late by one step.

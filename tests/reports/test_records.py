@@ -1,4 +1,4 @@
-"""What a run records: truth with gaps, truth as a function, named components, what is kept.
+"""The record of a run: truth with gaps, truth as a function, named components, kept variables.
 
 | Report | Situation |
 |---|---|

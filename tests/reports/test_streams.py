@@ -145,7 +145,7 @@ def test_a_late_one_moves_no_clock_backwards() -> None:
     run = f.run(f.start(PRIOR), TIMES, events, delayed=late)
     assert run["time"].values.tolist() == TIMES.tolist()
     check(f.final_state(run), f, [*ON_TIME, (1.5, 1, 0.4)], 1e-9)
-    # What was recorded before it came does not know it.
+    # Records from before it came do not know it.
     mean, _ = joint(ON_TIME[:3], 3.0)
     assert np.allclose(run["mean"].values[2, 0], mean, atol=1e-9)
 
@@ -320,7 +320,7 @@ def test_missing_numbers_are_no_evidence(linearization: Any) -> None:
 
 @EACH
 def test_a_velocity_that_is_reset_has_no_share_in_the_position(family: str) -> None:
-    """PX4-Autopilot pull 23644: what follows is right for both, by the same joint Gaussian."""
+    """PX4-Autopilot pull 23644: the rest is right for both, by the same joint Gaussian."""
     make, tolerance = FAMILIES[family]
     f = make(MOTION, [PLACE])
     state = f.start(PRIOR, rng=np.random.default_rng(0))

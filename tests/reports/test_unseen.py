@@ -229,7 +229,7 @@ def log_within(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def test_weights_of_minus_infinity_time_after_time() -> None:
-    """Gen.jl issue 117: what one observation excludes stays excluded, and no weight is NaN.
+    """Gen.jl issue 117: states that one observation excludes stay excluded, and no weight is NaN.
 
     Uniform errors leave the interval that all observations have in common. One that excludes all
     that is left contradicts the model, which is an error that says so.
@@ -291,7 +291,7 @@ def test_either_component_is_missing_at_each_time() -> None:
 
 @pytest.mark.parametrize("linearization", ["extended", "unscented"])
 def test_a_direction_at_a_range_of_zero(linearization: Any) -> None:
-    """ardupilot issue 19825: x / r at r = 0 is NaN, and the covariance stays what it was."""
+    """ardupilot issue 19825: x / r at r = 0 is NaN, and the covariance stays as it was."""
 
     def look(x: np.ndarray) -> np.ndarray:
         r = np.linalg.norm(x, axis=-1, keepdims=True)
