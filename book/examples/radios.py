@@ -2,6 +2,7 @@
 
 import sys
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ STEP_STD = (0.045, 0.045, 0.022)  # forward and left in m, turn in rad, for a se
 RANGE_STD = 0.15  # in m
 
 
-def drive(x, t, dt, inputs):
+def drive(x: np.ndarray, t: float, dt: float, inputs: Inputs) -> np.ndarray:
     """Move poses (..., 3 A) by the robots' odometry."""
     poses = x.reshape(*x.shape[:-1], -1, 3)
     for _, length, rates in inputs.pieces(t, dt):
@@ -27,23 +28,24 @@ def drive(x, t, dt, inputs):
     return poses.reshape(x.shape)
 
 
-def make_model(data):
+def make_model(data: datasets.Dataset) -> Model:
     """Return the model of all robots' poses, which their odometry drives."""
     n = 3 * len(data.robots)
-    inputs = Inputs(*data.displacement_rates(), np.zeros((n, n)))
+    times, rates = data.displacement_rates()
+    inputs = Inputs(times, rates, np.zeros((n, n)))
     noise_cov = np.diag(np.tile(np.square(STEP_STD), n // 3))
     periods = {k: 2 * np.pi for k in range(2, n, 3)}
     move = partial(drive, inputs=inputs)
     return Model(n, move, lambda t, dt: dt * noise_cov, periods=periods)
 
 
-def list_ranges(data):
+def list_ranges(data: datasets.Dataset) -> list[Observation]:
     """Return the ranges as observations, each with its sensor."""
     places = {robot: [3 * k, 3 * k + 1] for k, robot in enumerate(data.robots)}
     anchors = data.of_kind("survey").set_index("subject")[["x", "y"]]
     observations = []
     for row in data.of_kind("range").itertuples():
-        end = {"observer": places.get(row.subject)}
+        end: dict[str, Any] = {"observer": places.get(row.subject)}
         if row.subject not in places:
             end = {"origin": anchors.loc[row.subject]}
         sensor = distance(places[row.robot], std=RANGE_STD, **end)
@@ -52,7 +54,7 @@ def list_ranges(data):
     return observations
 
 
-RULES = {
+RULES: dict[str, dict[str, Any]] = {
     "no communication": {"share_observations": False},
     "naive fusion": {"share_observations": False, "fusion": naive_fusion},
     "intersection": {"share_observations": False, "fusion": covariance_intersection},

@@ -124,7 +124,10 @@ def odometry_of_each_robot() -> Comparison:
         Inputs([0.0], [[1.0]], [[0.01]]),
         Inputs([0.0, 1.0], [[2.0], [0.5]], [[0.04]]),
     ]
-    robots = [InputModel.from_inputs(1, lambda x, u, dt: x + u * dt, u) for u in logs]
+    robots = [
+        InputModel.from_inputs(1, lambda x, u, dt: x + u * dt, inputs)
+        for inputs in logs
+    ]
     team = AgentModels.from_models(robots)
     f = GaussianFilter(team, [UNIT, None], share_observations=False)
     state = f.step(f.start(PRIOR), 2.0, [[2.6], None])
@@ -172,8 +175,9 @@ def evidence() -> Comparison:
 
 
 def errors_of_own_places() -> Comparison:
-    """Each of two robots in one state is judged by its own place; the truth has a gap."""
-    f = GaussianFilter(STILL, [UNIT, component([1], std=1.0)], share_observations=False)
+    """Two robots in one state judged by their own places; the truth has a gap."""
+    sensors = [UNIT, component([1], std=1.0)]
+    f = GaussianFilter(STILL, sensors, share_observations=False)
     truth = {1.0: [0.5, 1.0], 2.0: [np.nan, np.nan], 3.0: [0.4, 1.2]}
     y = np.array([[1.0], [1.0], [1.0]])
     run = f.run(

@@ -54,6 +54,9 @@ BOXES = {"exercise": "Exercise: ", "prf:algorithm": "Algorithm: ", "admonition":
 LINK = re.compile(r"\[([^\[\]]+)\]\((?!https?:)[^()\s]+\.(?:ipynb|md)(?:#[^()\s]*)?\)")
 """A link to another page."""
 INCLUDE = re.compile(r"^```\{include\} _generated/reproductions\.md\n```$", re.M)
+PROGRAM = re.compile(
+    r"^```\{literalinclude\} (?P<path>\S+)\n(?P<options>(?::.*\n)*)```$", re.M
+)
 MADE = re.compile(r"^```\{include\} _generated/\S+\n```$", re.M)
 HELP = """# API reference
 
@@ -219,11 +222,16 @@ def plain(text: str, page: str, all_names: Names, references: BibliographyData) 
         head = f"**{BOXES[match['kind']]}{match['title']}**"
         return f"{head}\n\n{OPTION.sub('', match['body']).strip()}\n"
 
+    def program(match: re.Match[str]) -> str:
+        code = (BOOK / match["path"]).read_text(encoding="utf-8").strip()
+        return f"```python\n{code}\n```"
+
     # Equations first: their numbers come from labels that are removed here.
     text = MATH.sub(equation, DOLLARS.sub(dollars, text))
     text = BOX.sub(box, text)
     text = GATE.sub(gate, text)
     text = INCLUDE.sub(lambda m: reproductions_text(), text)
+    text = PROGRAM.sub(program, text)
     # Parts that the build computes are files of the built book only.
     text = MADE.sub(
         "*The page of the book has a list here that the build computes.*", text
