@@ -145,7 +145,7 @@ for name, f in families.items():
     run = f.run(state, None, observations, truth=truth)
     late = run.sel(time=slice(10, None))
     squared = late["squared_error"].sel(component=list(TARGET.names[:2]))
-    error = np.sqrt(squared.sum("component").mean())
+    error = np.sqrt(squared.sum("component", skipna=False).mean())
     nees = late["nees"].mean() / 4
     rejected = int(run["rejected"].sum())
     floats = int(run["scalars"].sum())

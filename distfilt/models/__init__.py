@@ -13,6 +13,7 @@ from .pendulum import (
     pendulum_rate,
     pendulum_states,
 )
+from .planar import drive_poses, planar_odometry
 from .quaternions import cross_matrix, quaternion_rate, rotation_matrix
 from .satellite import clohessy_wiltshire, satellite_pose
 from .swarm import RotatingMixture, Swarm, rotating_swarm
@@ -28,6 +29,7 @@ __all__ = [
     "clohessy_wiltshire",
     "constant_velocity",
     "cross_matrix",
+    "drive_poses",
     "lorenz63",
     "occulted",
     "orbit",
@@ -37,6 +39,7 @@ __all__ = [
     "pendulum_chart",
     "pendulum_rate",
     "pendulum_states",
+    "planar_odometry",
     "quaternion_rate",
     "rk4",
     "rotating_swarm",

@@ -14,6 +14,7 @@ from .kinds import (
     stack,
 )
 from .likelihood import LikelihoodSensor
+from .sightings import sighted_cov, sighted_place
 
 __all__ = [
     "LikelihoodSensor",
@@ -27,6 +28,8 @@ __all__ = [
     "increment",
     "line_angle",
     "range_bearing",
+    "sighted_cov",
+    "sighted_place",
     "stack",
     "wrap",
 ]

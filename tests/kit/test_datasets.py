@@ -12,6 +12,7 @@ import pytest
 
 from bookkit import datasets
 from bookkit.datasets import DataError, Defects
+from distfilt.models import planar_odometry
 
 CLEAN = Defects.none()
 NOISELESS = (0.0, 0.0, 0.0, 0.0)
@@ -70,12 +71,117 @@ def test_a_set_of_utias_by_hand(tmp_path: Path) -> None:
 def test_odometry_is_averaged_over_time(tmp_path: Path) -> None:
     """Between 0.5 and 1.25 s: two thirds of 0.5 m/s, one third of 1 m/s."""
     data = datasets.read_utias(write_utias(tmp_path))
-    averages = data.average_odometry(np.array([0.5, 1.25, 3.0]))
-    assert np.allclose(averages[0, 0], [(2 * 0.5 + 1.0) / 3, 0.2 / 3])
-    # The last input holds on; before the first one the robot stands.
-    assert np.allclose(averages[1, 0], [0.75 / 1.75, 0.2 * 0.75 / 1.75])
-    earlier = data.average_odometry(np.array([-1.0, 0.0]))
-    assert np.array_equal(earlier, np.zeros((1, 1, 2)))
+    times, rates = data.body_rates(0.75)
+    assert times.tolist() == [0.0, 0.75, 1.5]
+    assert np.allclose(rates[0], [0.5, 0.0, 0.0])
+    assert np.allclose(rates[1], [(0.5 + 2 * 1.0) / 3, 0.0, 2 * 0.2 / 3])
+    # The last input holds on.
+    assert np.allclose(rates[2], [2 * 1.0 / 3, 0.0, 2 * 0.2 / 3])
+    times, rates = data.body_rates()
+    assert times.tolist() == [0.0, 1.0, 2.0]
+    assert rates.tolist() == [[0.5, 0, 0], [1.0, 0, 0.2], [0, 0, 0]]
+
+
+def test_observations_are_shifted_and_grouped(tmp_path: Path) -> None:
+    text = "100.5 14 2.5 0.1\n100.5 5 1.0 0.0\n101.5 14 2.0 -0.1\n"
+    folder = write_utias(tmp_path, Robot1_Measurement=text)
+    data = datasets.read_utias(folder)
+    groups = data.shifted("range_bearing", -0.3).by_step("range_bearing", 0.2)
+    # The robot that reads its own barcode is left out.
+    assert {k: len(group) for k, group in groups.items()} == {1: 1, 6: 1}
+    robot, subject, value = groups[6][0]
+    assert (robot, subject, value.tolist()) == ("1", "6", [2.0, -0.1])
+    # The order of time holds for the odometry in between, and the log itself is not changed.
+    later = data.shifted("range_bearing", 5.0).events
+    assert later["kind"].tolist()[:3] == ["odometry"] * 3
+    assert data.events["kind"].tolist()[1] == "range_bearing"
+
+
+# The form of the published files, with numbers of our own: four lines of comment, of which one
+# calls barcodes subjects, tabs and spaces, line ends of another system, several sightings at once.
+HEAD = "# A collection\r\n# made by somebody 2009\r\n"
+PUBLISHED = {
+    "Barcodes.dat": "# Barcode Data Format:\r\n# Subject #    Barcode #\r\n"
+    "  1 \t   5 \r\n  2 \t  14 \r\n  6 \t  72 \r\n",
+    "Landmark_Groundtruth.dat": "# Format:\r\n"
+    "# Subject #    x [m]    y [m]    x std-dev [m]    y std-dev [m] \r\n"
+    "  6 \t 1.25000000 \t -3.50000000 \t 0.00010000 \t 0.00030000 \r\n",
+    "Robot1_Odometry.dat": "# Format:\r\n"
+    "# Time [s]    forward velocity [m/s]    angular velocity[rad/s] \r\n"
+    "1248000000.100 \t  0.100 \t -0.250 \r\n1248000000.115 \t  0.000 \t  0.000 \r\n",
+    "Robot1_Measurement.dat": "# Format:\r\n"
+    "# Time [s]    Subject #    range [m]    bearing [rad] \r\n"
+    "1248000000.900 \t  14 \t  3.000 \t -0.250 \r\n"
+    "1248000000.900 \t  72 \t  6.500 \t  0.125 \r\n"
+    "1248000001.150 \t  43 \t  1.000 \t  0.000 \r\n",
+    "Robot1_Groundtruth.dat": "# Format:\r\n"
+    "# Time [s]    x [m]    y [m]    orientation [rad] \r\n"
+    "1247999990.000 \t 1.00000000 \t -3.00000000 \t 2.25000000 \r\n"
+    "1248000000.900 \t 1.00000000 \t -3.00000000 \t 2.25000000 \r\n",
+    "Robot2_Odometry.dat": "1248000000.050 \t  0.000 \t  0.000 \r\n",
+    "Robot2_Measurement.dat": "# nothing seen\r\n",
+}
+
+
+def write_published(folder: Path) -> Path:
+    """Write the set; the second robot has no truth."""
+    folder.mkdir(exist_ok=True)
+    for name, text in PUBLISHED.items():
+        (folder / name).write_bytes((HEAD + text).encode())
+    return folder
+
+
+def test_a_set_in_the_published_form(tmp_path: Path) -> None:
+    folder = write_published(tmp_path)
+    with pytest.raises(DataError, match=r"Measurement.dat:7: barcode 43 is not in"):
+        datasets.read_utias(folder)
+    data = datasets.read_utias(folder, unknown="drop")
+    assert data.robots == ("1", "2") and data.dropped == 1
+    # Barcode 14 is robot 2, and 72 is landmark 6, whatever the head says.
+    seen = data.of_kind("range_bearing")
+    assert seen["subject"].tolist() == ["2", "6"]
+    assert seen[["range", "bearing"]].to_numpy().tolist() == [
+        [3.0, -0.25],
+        [6.5, 0.125],
+    ]
+    # Seconds since 1970 keep their milliseconds.
+    assert np.allclose(seen["time"], 0.85, atol=1e-6)
+    assert np.allclose(data.truth["time"], [-10.05, 0.85], atol=1e-6)
+    assert data.origin == pytest.approx(1248000000.05, abs=1e-6)
+    times, rates = data.body_rates()
+    assert np.allclose(times, [0.0, 0.05, 0.065], atol=1e-6)
+    assert rates[1].tolist() == [0.1, 0.0, -0.25, 0.0, 0.0, 0.0]
+
+
+def test_the_truth_is_not_needed(tmp_path: Path) -> None:
+    """Without the files of truth the log is the same, and only scores are missing."""
+    folder = write_published(tmp_path)
+    with_truth = datasets.read_utias(folder, unknown="drop")
+    for path in folder.glob("*Groundtruth.dat"):
+        path.unlink()
+    data = datasets.read_utias(folder, unknown="drop")
+    assert data.events.equals(with_truth.events)
+    assert data.truth.empty and data.begin == np.inf
+    assert data.landmarks.index.tolist() == ["6"]
+    assert data.landmarks.isna().all(axis=None)
+    rng = np.random.default_rng(0)
+    with pytest.raises(DataError, match=r"no pose of robot 1, 2 at 0.5 s, .* none"):
+        data.start_poses(0.5, std=(0.1, 0.1, 0.1), rng=rng)
+
+
+def test_first_poses_are_the_truth_with_errors(tmp_path: Path) -> None:
+    data = datasets.read_utias(write_utias(tmp_path))
+    std = (0.3, 0.2, 0.1)
+    draws = [
+        data.start_poses(1.0, std=std, rng=np.random.default_rng(seed))
+        for seed in range(400)
+    ]
+    means = np.array([mean for mean, _ in draws])
+    errors = means - data.true_poses(np.array([1.0])).ravel()
+    assert np.allclose(errors.std(axis=0), std, rtol=0.15)
+    assert np.allclose(draws[0][1], np.diag(np.square(std)))
+    with pytest.raises(DataError, match=r"robot 1 at 9 s, it has 0.0 to 2.0 s"):
+        data.start_poses(9.0, std=std, rng=np.random.default_rng(0))
 
 
 def test_the_truth_has_gaps(tmp_path: Path) -> None:
@@ -83,6 +189,8 @@ def test_the_truth_has_gaps(tmp_path: Path) -> None:
     data = datasets.read_utias(write_utias(tmp_path, Robot1_Groundtruth=text))
     poses = data.true_poses(np.array([0.5, 3.0, 5.5]))
     assert np.isnan(poses[:, 0, 0]).tolist() == [False, True, False]
+    # At both ends of the gap a pose has been logged.
+    assert data.true_poses(np.array([1.0, 5.0]))[:, 0, 0].tolist() == [1.0, 5.0]
     filled = data.true_poses(np.array([3.0]), longest_gap=4.0)
     assert filled[0, 0, 0] == 3.0
 
@@ -148,10 +256,11 @@ def test_a_generated_set_without_noise_is_exact(tmp_path: Path) -> None:
     times = 0.1 * np.arange(190)
     truth = data.true_poses(times)
     pose = truth[0]
-    for k, inputs in enumerate(data.average_odometry(times)):
-        middle = pose[:, 2] + 0.05 * inputs[:, 1]
+    _, rates = data.body_rates(0.1)
+    for k, inputs in enumerate(rates[:189].reshape(189, -1, 3)):
+        middle = pose[:, 2] + 0.05 * inputs[:, 2]
         shift = [np.cos(middle), np.sin(middle)] * inputs[:, 0]
-        pose = pose + 0.1 * np.stack([*shift, inputs[:, 1]], axis=-1)
+        pose = pose + 0.1 * np.stack([*shift, inputs[:, 2]], axis=-1)
         assert np.allclose(pose, truth[k + 1], atol=2e-3)
     seen = data.of_kind("range_bearing")
     assert len(seen) > 50
@@ -194,9 +303,9 @@ def test_a_generated_set_has_its_defects(tmp_path: Path) -> None:
     first = plain.of_kind("range_bearing")["time"].min()
     assert late.of_kind("range_bearing")["time"].min() == pytest.approx(first + 0.3)
     biased = make("bias", Defects(turn_bias=0.5))
-    difference = biased.average_odometry(np.array([0.0, 50.0]))
+    _, difference = biased.body_rates(50.0)
     true_turn = np.diff(biased.true_poses(np.array([0.1, 50.0])), axis=0)[0, :, 2] / 50
-    assert np.abs(difference[0, :, 1] - true_turn).max() > 0.1
+    assert np.abs(difference[0, 2::3] - true_turn).max() > 0.1
 
 
 def test_a_problem_with_ranges_by_hand(tmp_path: Path) -> None:
@@ -223,8 +332,9 @@ def test_a_problem_with_ranges_by_hand(tmp_path: Path) -> None:
     assert data.true_state(0.25).tolist() == [0.5, 0.0, 0.55, 5.0, 5.0, 0.0]
     with pytest.raises(DataError, match="none for robot B"):
         data.prior_poses()
-    with pytest.raises(DataError, match="every robot must have one"):
-        data.displacement_rates()
+    times, rates = data.body_rates()
+    assert times.tolist() == [0.0, 0.5]
+    assert np.allclose(rates[0, 2], 0.2 / 0.5) and not rates[:, 3:].any()
 
 
 @pytest.mark.parametrize(
@@ -233,9 +343,10 @@ def test_a_problem_with_ranges_by_hand(tmp_path: Path) -> None:
         ("EDGE_RANGE 10.5 A1 L0 4.5", r"pyfg:12: expected 3 numbers .* got 2"),
         ("EDGE_RANGE 10.5 A1 L9 4.5 0.1", r"pyfg:12: no VERTEX line declares 'L9'"),
         ("EDGE_SE2 10 A0 B1 0 0 0 1 0 0 1 0 1", r"pyfg:12: .* to the next pose"),
-        ("VERTEX_SE2 10.2 A2 0 0 0", r"pyfg:12: times of robot A must increase"),
+        ("VERTEX_SE2 10.2 A2 0 0 0", r"pyfg:12: times of robot A must not"),
         ("VERTEX_SE2 11 L2 0 0 0", r"pyfg:12: expected a robot's letter"),
         ("VERTEX_SE3:QUAT 11 A2 0 0 0 0 0 0 1", r"pyfg:12: .* in space"),
+        ("VERTEX_SE2 1.7e18 A2 0 0 0", r"pyfg:12: .* in seconds, .* nanoseconds"),
         ("EDGE_FOO 1", r"pyfg:12: expected one of VERTEX_SE2, "),
     ],
 )
@@ -257,16 +368,15 @@ def test_a_generated_problem_without_noise_is_exact(tmp_path: Path) -> None:
         noise=NOISELESS,
     )
     data = datasets.read_pyfg(path)
-    begins, rates = data.displacement_rates()
-    assert begins[0] == 0.0 and rates.shape == (40, 12)
-    pose = data.true_poses(np.array([0.0]))[0]
-    for k, rate in enumerate(rates):
-        forward, left, turn = 0.5 * rate.reshape(-1, 3).T
-        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        shift = [c * forward - s * left, s * forward + c * left, turn]
-        pose = pose + np.stack(shift, axis=-1)
-        expected = data.true_poses(np.array([begins[k] + 0.5]))[0]
-        assert np.allclose(pose, expected, atol=1e-4)
+    begins, rates = data.body_rates()
+    assert begins[0] == 0.0 and rates.shape == (41, 12)
+    model = planar_odometry(begins, rates)
+    state = data.true_state(0.0)
+    for k in range(40):
+        # In two parts, as by an observation in between
+        state = model.step(state, begins[k], 0.2)
+        state = model.step(state, begins[k] + 0.2, 0.3)
+        assert np.allclose(state, data.true_state(begins[k] + 0.5), atol=2e-4)
     for row in data.of_kind("range").itertuples():
         poses = data.true_poses(np.array([row.time]))[0]
         own = poses[data.robots.index(row.robot), :2]
@@ -278,6 +388,65 @@ def test_a_generated_problem_without_noise_is_exact(tmp_path: Path) -> None:
     mean, cov = data.prior_poses()
     error = mean - data.true_state(0.0)
     assert (np.abs(error) < 4 * np.sqrt(cov.diagonal())).all() and error.any()
+
+
+# Two robots with rates of their own and a pause; poses at one time; an edge's own time is wrong.
+UNEVEN = """\
+VERTEX_SE2 1248000000.100000000 A7 0.0 0.0 1.5
+VERTEX_SE2 1248000000.500000000 A8 0.0 1.0 1.5
+VERTEX_SE2 1248000000.500000000 A9 0.0 1.0 1.5
+VERTEX_SE2 1248000000.900000000 A10 0.0 2.0 1.5
+VERTEX_SE2 1248000000.100000000 B0 5.0 5.0 0.0
+VERTEX_SE2 1248000052.100000000 B1 5.0 5.0 0.0
+VERTEX_XY L6 3.0 4.0
+EDGE_SE2 0.0 A7 A8 1.0 0.0 1.5707963267948966 1 0 0 1 0 1
+EDGE_SE2 0.0 A8 A9 1.0 0.0 0.0 1 0 0 1 0 1
+EDGE_SE2 0.0 A9 A10 0.5 0.25 0.0 1 0 0 1 0 1
+EDGE_SE2 0.0 B0 B1 0.0 0.0 6.283185307179586 1 0 0 1 0 1
+EDGE_RANGE 0.0 A8 L6 4.0 0.09
+EDGE_RANGE 1248000077.0 A10 B0 5.5 0.09
+"""
+
+
+def test_uneven_steps_and_repeated_times(tmp_path: Path) -> None:
+    path = tmp_path / "uneven.pyfg"
+    path.write_text(UNEVEN)
+    data = datasets.read_pyfg(path)
+    steps = data.of_kind("displacement")
+    # A7 to A9, after the quarter turn to the left: one metre ahead and one to the left.
+    first = steps[steps["robot"] == "A"].iloc[0]
+    assert np.allclose(
+        first[["forward", "left", "turn", "duration"]].tolist(),
+        [1.0, 1.0, np.pi / 2, 0.4],
+        atol=1e-6,
+    )
+    assert len(data.truth) == 5 and data.begin == 0.0
+    # Edges have the time of their pose.
+    ranges = data.of_kind("range")
+    assert np.allclose(ranges["time"], [0.4, 0.8], atol=1e-6)
+    assert ranges["subject"].tolist() == ["L6", "B"]
+    # The rates lead from pose to pose, over any pieces; a whole turn leaves no trace.
+    model = planar_odometry(*data.body_rates())
+    state = np.array([0.0, 0.0, 0.0, 5.0, 5.0, 0.0])
+    for t, dt in ((0.0, 0.15), (0.15, 0.25), (0.4, 0.4), (0.8, 51.2)):
+        state = model.step(state, t, dt)
+    # Turned to the left, 0.5 ahead is up, and 0.25 to the left is backwards.
+    expected = [1.0 - 0.25, 1.0 + 0.5, np.pi / 2, 5.0, 5.0, 0.0]
+    assert np.allclose(state, expected, atol=1e-5)
+
+
+def test_a_clock_in_nanoseconds(tmp_path: Path) -> None:
+    path = tmp_path / "nano.pyfg"
+    path.write_text(
+        "VERTEX_SE2 1730000000000000000 A0 0 0 0\n"
+        "VERTEX_SE2 1730000001500000000 A1 1 0 0\n"
+        "EDGE_SE2 0 A0 A1 1.5 0 0 1 0 0 1 0 1\n"
+    )
+    with pytest.raises(DataError, match="nano.pyfg:1: expected a time in seconds"):
+        datasets.read_pyfg(path)
+    data = datasets.read_pyfg(path, time_unit=1e-9)
+    times, rates = data.body_rates()
+    assert np.allclose(times, [0.0, 1.5]) and np.allclose(rates[0], [1.0, 0.0, 0.0])
 
 
 def test_files_are_found_in_the_reader_s_folder(

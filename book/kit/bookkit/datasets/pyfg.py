@@ -12,7 +12,9 @@ Each line begins with the word of its kind. In the plane these are
 | ``EDGE_SE2_XY t A0 L0 forward left cov`` | a landmark in the robot's frame |
 | ``EDGE_RANGE t A0 L0 range variance`` | a distance to a landmark or to another robot's pose |
 
-with the upper triangle of each covariance row by row. Landmarks' names begin with L.
+with the upper triangle of each covariance row by row. Landmarks' names begin with L. An edge ties
+poses, so its time is that of its poses: the ``t`` of an edge is zero in some published files, and
+off by seconds in others. A displacement is in the frame of the pose before it.
 """
 
 from __future__ import annotations
@@ -46,30 +48,37 @@ _KINDS = {
 }
 
 
-def read_pyfg(path: str | Path) -> Dataset:
+LATEST = 1e11
+"""A clock in seconds shows less, for three thousand years to come."""
+
+
+def read_pyfg(path: str | Path, *, time_unit: float = 1.0) -> Dataset:
     """Read a planar problem with ranges from a ``.pyfg`` file.
 
     Parameters
     ----------
     path : path
+    time_unit : float
+        The file's unit of time, in s: 1e-9 for nanoseconds.
 
     Returns
     -------
     Dataset
         Events ``prior``, ``survey``, ``displacement`` (whose time is the end of the movement),
         ``offset`` and ``range``, each with its covariance. Subjects are landmarks or robots.
-        Times count from the first pose.
+        Times count from the first pose. Poses of one robot at one time are joined, and so are
+        the displacements between them.
 
     Raises
     ------
     DataError
         With file and line: an unknown kind of line, one of a problem in space, a short line, a
         pose that no ``VERTEX_SE2`` declares, odometry between poses that are not successive,
-        times of one robot's poses that do not increase.
+        times of one robot's poses that decrease, or that are no seconds.
     """
     reader = LineReader(Path(path))
     lines = [_read_line(reader, number, words) for number, words in reader.lines]
-    poses = _read_poses(reader, lines)
+    poses = _read_poses(reader, lines, time_unit)
     if not poses:
         raise DataError(f"{reader.path}: no VERTEX_SE2, so that no robot is found")
     # Landmarks may be declared behind the edges that refer to them, so all lines are read first.
@@ -82,15 +91,20 @@ def read_pyfg(path: str | Path) -> Dataset:
     for number, word, names, values in lines:
         if word in _KINDS:
             _check_names(reader, number, names, {**poses, **landmarks})
+            # A prior of a landmark has no pose, and counts from the beginning.
+            owner = poses.get(names[0])
+            values[0] = origin if owner is None else owner[0]
             event = _make_event(reader, number, word, names, values, poses)
             events.append((event[0] - origin, *event[1:]))
+    events = _join_displacements(events)
     # A1 is pose 1 of robot A: the letter names the robot.
     truth = [(v[0] - origin, name[0], *v[1:]) for name, v in poses.items()]
+    truth_frame = pd.DataFrame(truth, columns=["time", "robot", *POSE])
     index = pd.Index(list(landmarks), name="subject")
     places = np.array(list(landmarks.values())).reshape(-1, 2)
     return Dataset(
         make_events(events),
-        pd.DataFrame(truth, columns=["time", "robot", *POSE]),
+        truth_frame.drop_duplicates(["time", "robot"], ignore_index=True),
         pd.DataFrame(places, index=index, columns=["x", "y"]),
         tuple(sorted({name[0] for name in poses})),
         origin=origin,
@@ -121,8 +135,10 @@ def _read_line(reader: LineReader, number: int, words: list[str]) -> Line:
     return number, word, names, reader.numbers(number, numbers, fields)
 
 
-def _read_poses(reader: LineReader, lines: list[Line]) -> dict[str, list[float]]:
-    """Return time and true pose by name; the times of each robot must increase."""
+def _read_poses(
+    reader: LineReader, lines: list[Line], time_unit: float
+) -> dict[str, list[float]]:
+    """Return time, in s, and true pose by name; the times of a robot must not decrease."""
     poses: dict[str, list[float]] = {}
     latest: dict[str, float] = {}
     for number, word, names, values in lines:
@@ -133,11 +149,18 @@ def _read_poses(reader: LineReader, lines: list[Line]) -> dict[str, list[float]]
             raise reader.error(
                 number, f"expected a robot's letter and a number, got {name!r}"
             )
-        # Two poses at one time would leave no time for the odometry between them.
-        if values[0] <= latest.get(name[0], -np.inf):
-            raise reader.error(number, f"times of robot {name[0]} must increase")
-        latest[name[0]] = values[0]
-        poses[name] = values
+        time = time_unit * values[0]
+        if abs(time) > LATEST:
+            raise reader.error(
+                number,
+                f"expected a time in seconds, got {values[0]:.3g}: time_unit=1e-9 reads "
+                "nanoseconds",
+            )
+        # Poses at one time are allowed: the truth may have a lower rate than the odometry.
+        if time < latest.get(name[0], -np.inf):
+            raise reader.error(number, f"times of robot {name[0]} must not decrease")
+        latest[name[0]] = time
+        poses[name] = [time, *values[1:]]
     return poses
 
 
@@ -179,10 +202,41 @@ def _make_event(
                 number, f"expected odometry to the next pose, got {' '.join(names)}"
             )
         # It is known when the movement has ended.
-        return poses[names[1]][0], robot, kind, "", measured, cov
+        end = poses[names[1]][0]
+        return end, robot, kind, "", (*measured, end - time), cov
     # A landmark keeps its whole name, another robot's pose gives its letter.
     subject = names[1] if names[1].startswith("L") else names[1][0]
     return time, robot, kind, subject, measured, cov
+
+
+def _join_displacements(events: list[Event]) -> list[Event]:
+    """Join each displacement without a duration with the one after it, or before it at the end."""
+    joined: list[Event] = []
+    # By robot: the place in `joined` of its last displacement.
+    last: dict[str, int] = {}
+    for event in sorted(events, key=lambda event: event[0]):
+        time, robot, kind, subject, values, cov = event
+        before = last.get(robot)
+        if kind != "displacement":
+            joined.append(event)
+        elif before is None or 0 not in (joined[before][4][3], values[3]):
+            last[robot] = len(joined)
+            joined.append(event)
+        else:
+            former = joined[before]
+            whole = (*_compose(former[4], values), former[4][3] + values[3])
+            total = None if cov is None or former[5] is None else former[5] + cov
+            joined[before] = (time, robot, kind, subject, whole, total)
+    return joined
+
+
+def _compose(first: tuple[float, ...], second: tuple[float, ...]) -> tuple[float, ...]:
+    """Return one displacement after another: p1 + R(turn 1) p2, and the sum of the turns."""
+    c = np.cos(first[2])
+    s = np.sin(first[2])
+    forward = first[0] + c * second[0] - s * second[1]
+    left = first[1] + s * second[0] + c * second[1]
+    return float(forward), float(left), first[2] + second[2]
 
 
 def _unpack_triangle(numbers: list[float], n: int) -> Array:

@@ -21,6 +21,7 @@ __all__ = [
     "LineReader",
     "locate",
     "make_events",
+    "stack_events",
 ]
 
 Array = NDArray[np.float64]
@@ -29,7 +30,7 @@ POSE = ("x", "y", "heading")
 
 VALUES = {
     "odometry": ("speed", "turn_rate"),
-    "displacement": ("forward", "left", "turn"),
+    "displacement": ("forward", "left", "turn", "duration"),
     "range_bearing": ("range", "bearing"),
     "offset": ("forward", "left"),
     "range": ("range",),
@@ -38,7 +39,8 @@ VALUES = {
 }
 """The values of each kind of event, in m, rad and s."""
 
-_COLUMNS = ("time", "robot", "kind", "subject", "value0", "value1", "value2", "cov")
+_VALUE_COLUMNS = ("value0", "value1", "value2", "value3")
+_COLUMNS = ("time", "robot", "kind", "subject", *_VALUE_COLUMNS, "cov")
 
 Event = tuple[float, str, str, str, tuple[float, ...], Array | None]
 """Time, robot, kind, subject, values and their covariance, if the file has one."""
@@ -105,9 +107,16 @@ class LineReader:
 
         A column `time` must not decrease.
         """
-        rows = [self.numbers(number, words, names) for number, words in self.lines]
-        # A file without lines gives no rows, and still all columns.
-        table = np.array(rows).reshape(-1, len(names.split()))
+        n_columns = len(names.split())
+        try:
+            # All lines at once: a real log has hundreds of thousands of them.
+            table = np.array([words for _, words in self.lines], dtype=float)
+        except ValueError:
+            table = np.zeros((0, 0))
+        if table.shape[1:] != (n_columns,) or not np.isfinite(table).all():
+            # One by one, to name the line that is wrong. A file without lines gives no rows.
+            rows = [self.numbers(number, words, names) for number, words in self.lines]
+            table = np.array(rows).reshape(-1, n_columns)
         if "time" in names.split():
             times = table[:, names.split().index("time")]
             # Equal times are allowed: a camera sees several barcodes in one picture.
@@ -127,7 +136,7 @@ class Dataset:
     events : DataFrame
         One row an event, in the order of time: ``time`` in s since `origin`, ``robot``, ``kind``,
         ``subject`` (the robot or landmark that is observed, or an empty text), ``value0`` to
-        ``value2`` with the meaning that `of_kind` gives them, and ``cov``, an array or None.
+        ``value3`` with the meaning that `of_kind` gives them, and ``cov``, an array or None.
     truth : DataFrame
         Poses ``time``, ``robot``, ``x``, ``y``, ``heading``; empty if the log has none.
     landmarks : DataFrame
@@ -176,54 +185,120 @@ class Dataset:
         last = float(self.events["time"].max())
         return np.arange(int(np.floor(last / dt + 1e-9)) + 1) * np.float64(dt)
 
-    def average_odometry(self, times: Array) -> Array:
-        """Return each robot's mean speed and turn rate between successive times, (T, A, 2).
+    def shifted(self, kind: str, seconds: float) -> Dataset:
+        """Return the log with all events of one kind later by so many seconds, as by a lag."""
+        times = self.events["time"] + seconds * (self.events["kind"] == kind)
+        events = self.events.assign(time=times)
+        events = events.sort_values("time", kind="stable", ignore_index=True)
+        return replace(self, events=events)
 
-        An input holds until the robot's next one; before its first one the robot stands.
+    def polar(self) -> Dataset:
+        """Return the log with offsets in a robot's frame as ranges and bearings.
+
+        Their covariances are left out: those of the published files are the same in all
+        directions, which no camera has.
         """
-        odometry = self.of_kind("odometry")
-        averages = np.zeros((len(times) - 1, len(self.robots), 2))
-        for k, robot in enumerate(self.robots):
-            rows = odometry[odometry["robot"] == robot]
-            logged = rows["time"].to_numpy()
-            if not logged.size:
-                continue
-            values = rows[["speed", "turn_rate"]].to_numpy()
-            # The integral up to each input's time; between them it is linear.
-            pieces = np.diff(logged)[:, None] * values[:-1]
-            integral = np.concatenate([np.zeros((1, 2)), np.cumsum(pieces, axis=0)])
-            # The last input is held to the end of the grid, and a second more.
-            held = max(times[-1] - logged[-1], 0.0)
-            knots = np.append(logged, logged[-1] + held + 1.0)
-            integral = np.append(
-                integral, integral[-1:] + (held + 1.0) * values[-1:], axis=0
-            )
-            for j in range(2):
-                # Mean over [a, b]: (F(b) - F(a)) / (b - a) with the integral F.
-                at_times = np.interp(times, knots, integral[:, j])
-                averages[:, k, j] = np.diff(at_times) / np.diff(times)
-        return averages
+        events = self.events.copy()
+        is_offset = (events["kind"] == "offset").to_numpy()
+        forward = events.loc[is_offset, "value0"].to_numpy(dtype=float)
+        left = events.loc[is_offset, "value1"].to_numpy(dtype=float)
+        events.loc[is_offset, "value0"] = np.hypot(forward, left)
+        events.loc[is_offset, "value1"] = np.arctan2(left, forward)
+        events.loc[is_offset, "kind"] = "range_bearing"
+        events.loc[is_offset, "cov"] = None
+        return replace(self, events=events)
 
-    def displacement_rates(self) -> tuple[Array, Array]:
-        """Return when each step begins, (T,), and all robots' displacements a second, (T, 3 A).
+    def by_step(self, kind: str, dt: float) -> dict[int, list[tuple[str, str, Array]]]:
+        """Return the observations of one kind by the nearest multiple of `dt`.
+
+        Each is a robot, a subject and the values. A robot that observes itself has read a wrong
+        name, and is left out.
+        """
+        rows = self.of_kind(kind)
+        rows = rows[rows["robot"] != rows["subject"]]
+        steps = np.rint(rows["time"] / dt).astype(int)
+        values = rows[list(VALUES[kind])].to_numpy(dtype=float)
+        groups: dict[int, list[tuple[str, str, Array]]] = {}
+        for step, robot, subject, value in zip(
+            steps, rows["robot"], rows["subject"], values, strict=True
+        ):
+            groups.setdefault(int(step), []).append((robot, subject, value))
+        return groups
+
+    def body_rates(self, dt: float | None = None) -> tuple[Array, Array]:
+        """Return all robots' measured motion as the inputs of `planar_odometry`.
+
+        Parameters
+        ----------
+        dt : float, optional
+            The means over cells of this length, in s. By default an input begins wherever one of
+            a robot begins.
+
+        Returns
+        -------
+        times : (T,)
+            When each input begins.
+        rates : (T, 3 A)
+            Forward and leftward speed and turn rate of each robot, in m/s, m/s and rad/s. An
+            input of odometry holds until the next one. A displacement is spread over its
+            duration. Without an input a robot stands.
 
         Raises
         ------
         DataError
-            If a robot lacks a step, or the steps differ in length.
+            If no robot has odometry or displacements.
         """
-        steps = self.of_kind("displacement").sort_values(["time", "robot"])
-        ends = steps["time"].unique()
-        n_robots = len(self.robots)
-        # The length of a step is the time between two ends, so there must be two.
-        if len(steps) != len(ends) * n_robots or len(ends) < 2:
-            raise DataError("displacements: every robot must have one in each step")
-        dt = float(ends[1] - ends[0])
-        if not np.allclose(np.diff(ends), dt, rtol=1e-6):
-            raise DataError("displacements: steps must have one length")
-        # By time and then by robot: one row a step holds all robots, in m/s and rad/s.
-        values = steps[list(VALUES["displacement"])].to_numpy(dtype=float)
-        return np.asarray(ends - dt), values.reshape(len(ends), -1) / dt
+        pieces = [self._list_inputs(robot) for robot in self.robots]
+        if not any(len(begins) for begins, _ in pieces):
+            raise DataError("events: none of odometry or displacement")
+        if dt is None:
+            knots = np.unique(np.concatenate([begins for begins, _ in pieces]))
+        else:
+            knots = self.grid(dt)
+        # The last input holds on, so its cell has any end behind it.
+        edges = np.append(knots, knots[-1] + (dt or 1.0))
+        rates = np.zeros((len(knots), len(pieces), 3))
+        for k, (begins, values) in enumerate(pieces):
+            if not len(begins):
+                continue
+            # The integral up to each input's begin; between them it is linear.
+            held = max(edges[-1] - begins[-1], 0.0) + 1.0
+            nodes = np.append(begins, begins[-1] + held)
+            steps = np.diff(nodes)[:, None] * values
+            integral = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+            for j in range(3):
+                # Mean over [a, b]: (F(b) - F(a)) / (b - a) with the integral F.
+                at_edges = np.interp(edges, nodes, integral[:, j])
+                rates[:, k, j] = np.diff(at_edges) / np.diff(edges)
+        return knots, rates.reshape(len(knots), -1)
+
+    def _list_inputs(self, robot: str) -> tuple[Array, Array]:
+        """Return when each input of a robot begins, (N,), and its rates, (N, 3)."""
+        own = self.events[self.events["robot"] == robot]
+        odometry = own[own["kind"] == "odometry"]
+        if len(odometry):
+            # Of several inputs at one time the last one holds.
+            odometry = odometry.drop_duplicates("time", keep="last")
+            values = odometry[["value0", "value1"]].to_numpy(dtype=float)
+            # A wheel measures no sideways speed.
+            return odometry["time"].to_numpy(dtype=float), np.insert(
+                values, 1, 0.0, axis=1
+            )
+        steps = own[own["kind"] == "displacement"]
+        begins: list[float] = []
+        inputs: list[list[float]] = []
+        rows = steps[["time", *_VALUE_COLUMNS]].to_numpy(dtype=float).tolist()
+        for end, forward, left, turn, duration in rows:
+            # A step begins where the former one ended, or after a pause.
+            begins += [end - duration, end]
+            rates = _rates_of_displacement(forward, left, turn, duration)
+            inputs += [rates, [0.0, 0.0, 0.0]]
+        if not begins:
+            return np.zeros(0), np.zeros((0, 3))
+        # The pause between two steps is often empty, or rounding alone.
+        times = np.array(begins)
+        lasts = np.append(np.diff(times) > 1e-6, True)
+        return times[lasts], np.array(inputs)[lasts]
 
     def prior_poses(self) -> tuple[Array, Array]:
         """Return mean (3 A,) and covariance of the poses that are known beforehand.
@@ -236,11 +311,59 @@ class Dataset:
         starts = self.of_kind("prior").drop_duplicates("robot").set_index("robot")
         missing = [robot for robot in self.robots if robot not in starts.index]
         if missing:
-            raise DataError(f"priors: none for robot {', '.join(missing)}")
+            raise DataError(
+                f"priors: none for robot {', '.join(missing)} (`start_poses` takes the first "
+                "poses from the truth, with errors)"
+            )
         starts = starts.loc[list(self.robots)]
         # The robots' starts are independent: a block for each on the diagonal.
         mean = starts[list(POSE)].to_numpy(dtype=float).ravel()
         return mean, np.asarray(block_diag(*starts["cov"]))
+
+    def start_poses(
+        self, t: float, *, std: Sequence[float], rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """Return mean (3 A,) and covariance of poses that somebody has measured at one time.
+
+        They are the true poses with Gaussian errors. Most logs have no priors, and a filter has to
+        begin somewhere.
+
+        Parameters
+        ----------
+        t : float
+            In s.
+        std : three float
+            Standard deviations of x, y and heading, in m and rad.
+        rng : numpy.random.Generator
+
+        Raises
+        ------
+        DataError
+            If the truth has a gap there.
+        """
+        poses = self.true_poses(np.array([t]))[0]
+        unknown = [
+            robot
+            for robot, pose in zip(self.robots, poses, strict=True)
+            if np.isnan(pose).any()
+        ]
+        if unknown:
+            raise DataError(
+                f"truth: no pose of robot {', '.join(unknown)} at {t:g} s, it has "
+                f"{self._describe_truth(unknown)}"
+            )
+        errors = np.asarray(std) * rng.standard_normal(poses.shape)
+        variances = np.tile(np.square(std), len(poses))
+        return (poses + errors).ravel(), np.diag(variances)
+
+    def _describe_truth(self, robots: Sequence[str]) -> str:
+        """Say from when to when the truth of some robots is known."""
+        spans = []
+        for robot in robots:
+            logged, _ = self._tracks[self.robots.index(robot)]
+            span = f"{logged[0]:.1f} to {logged[-1]:.1f} s" if logged.size else "none"
+            spans.append(span)
+        return ", ".join(spans)
 
     def true_poses(self, times: Array, *, longest_gap: float = 1.0) -> Array:
         """Return each robot's true pose at `times`, (T, A, 3), for scores alone.
@@ -259,7 +382,9 @@ class Dataset:
             is_known = inside
             if len(logged) > 1:
                 gap = logged[upper] - logged[upper - 1]
-                is_known = inside & (gap <= longest_gap)
+                # A logged pose is known, whatever is around it.
+                is_logged = np.isin(times, logged)
+                is_known = inside & ((gap <= longest_gap) | is_logged)
             for j in range(3):
                 series = np.interp(times, logged, values[:, j])
                 poses[:, k, j] = np.where(is_known, series, np.nan)
@@ -268,6 +393,12 @@ class Dataset:
     def true_state(self, t: float) -> Array:
         """Return the true poses of all robots at one time, one after the other, (3 A,)."""
         return self.true_poses(np.array([t])).ravel()
+
+    @property
+    def begin(self) -> float:
+        """The first time, in s, at which the true poses of all robots are known; inf if never."""
+        starts = [logged[0] if logged.size else np.inf for logged, _ in self._tracks]
+        return float(max(starts))
 
     @cached_property
     def _tracks(self) -> list[tuple[Array, Array]]:
@@ -309,12 +440,50 @@ def make_events(events: Sequence[Event]) -> pd.DataFrame:
     """Return events as a table in the order of time; those of one time keep theirs."""
     rows = []
     for time, robot, kind, subject, values, cov in events:
-        # Three columns of values for all kinds.
-        padded = [*values, np.nan, np.nan, np.nan][:3]
+        # As many columns of values for all kinds.
+        padded = [*values, *[np.nan] * (len(_VALUE_COLUMNS) - len(values))]
         rows.append((time, robot, kind, subject, *padded, cov))
     frame = pd.DataFrame(rows, columns=list(_COLUMNS))
     # Without rows the columns have no type of their own.
-    frame = frame.astype({"time": float, "value0": float, "value1": float})
-    frame["value2"] = frame["value2"].astype(float)
+    frame = frame.astype(dict.fromkeys(("time", *_VALUE_COLUMNS), float))
     # A stable sort, so that events of one time keep their order.
     return frame.sort_values("time", kind="stable").reset_index(drop=True)
+
+
+def stack_events(
+    table: Array, robot: str, kind: str, subjects: Sequence[str] | str = ""
+) -> pd.DataFrame:
+    """Return events of one kind and one robot from rows (time, values ...), without sorting."""
+    columns: dict[str, object] = {
+        "time": table[:, 0],
+        "robot": robot,
+        "kind": kind,
+        "subject": subjects,
+    }
+    for k, name in enumerate(_VALUE_COLUMNS, start=1):
+        columns[name] = table[:, k] if k < table.shape[1] else np.nan
+    # `cov` is an object for each row, and None here.
+    frame = pd.DataFrame(columns)
+    frame["cov"] = None
+    return frame[list(_COLUMNS)]
+
+
+def _rates_of_displacement(
+    forward: float, left: float, turn: float, duration: float
+) -> list[float]:
+    """Return the constant rates of a body that end in a displacement.
+
+    A displacement is in the frame of the pose before it. On an arc the body moves along its
+    heading of each moment, so that the chord d = R(turn / 2) v duration sinc(turn / 2) is turned
+    back by half of the turn.
+    """
+    # Whole turns within one displacement leave no trace in it.
+    turn = float((turn + np.pi) % (2 * np.pi) - np.pi)
+    scale = duration * np.sinc(turn / (2 * np.pi))
+    c = np.cos(turn / 2)
+    s = np.sin(turn / 2)
+    return [
+        float((c * forward + s * left) / scale),
+        float((c * left - s * forward) / scale),
+        turn / duration,
+    ]

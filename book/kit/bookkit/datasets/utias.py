@@ -3,7 +3,8 @@
 K. Y. K. Leung, Y. Halpern, T. D. Barfoot and H. H. T. Liu, International Journal of Robotics
 Research 30 (2011) 969-974. A set is a folder with ``Barcodes.dat``, ``Landmark_Groundtruth.dat``
 and, for each robot N, ``RobotN_Groundtruth.dat``, ``RobotN_Odometry.dat`` and
-``RobotN_Measurement.dat``: columns of text, with comments behind ``#``.
+``RobotN_Measurement.dat``: columns of text, with comments behind ``#``. The head of a file of
+measurements calls its second column a subject; it holds barcodes.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import pandas as pd
 
-from .table import POSE, DataError, Dataset, Event, LineReader, make_events
+from .table import POSE, DataError, Dataset, LineReader, stack_events
 
 __all__ = ["read_utias"]
 
@@ -34,7 +36,8 @@ def read_utias(
     Returns
     -------
     Dataset
-        Times count from the first event; subjects are the numbers in ``Barcodes.dat``.
+        Times count from the first event; subjects are the numbers in ``Barcodes.dat``. The files
+        of ground truth may be missing: then the truth is empty and the landmarks' places are NaN.
 
     Raises
     ------
@@ -44,8 +47,11 @@ def read_utias(
     """
     root = Path(folder)
     barcodes = _read_barcodes(root / "Barcodes.dat")
-    landmarks = _read_landmarks(root / "Landmark_Groundtruth.dat")
     robots = _find_robots(root)
+    landmarks = _read_landmarks(
+        root / "Landmark_Groundtruth.dat",
+        [subject for subject in barcodes.values() if subject not in robots],
+    )
     # Lines "time v w" in s, m/s and rad/s.
     odometry = {}
     for robot in robots:
@@ -53,24 +59,28 @@ def read_utias(
         odometry[robot] = reader.table("time speed turn_rate")
         if not odometry[robot].size:
             raise DataError(f"{reader.path}: no line of odometry")
-    events: list[Event] = []
+    events = []
     truths = []
     dropped = 0
     for robot in robots:
-        for time, speed, turn_rate in odometry[robot].tolist():
-            values = (speed, turn_rate)
-            events.append((time, robot, "odometry", "", values, None))
+        events.append(stack_events(odometry[robot], robot, "odometry"))
         path = root / f"Robot{robot}_Measurement.dat"
         observed, n_unknown = _read_measurements(path, robot, barcodes, unknown)
-        events += observed
+        events.append(observed)
         dropped += n_unknown
-        reader = LineReader(root / f"Robot{robot}_Groundtruth.dat")
-        # Lines "time x y theta" in s, m and rad, at a hundred a second in the real files.
-        table = reader.table("time x y heading")
+        path = root / f"Robot{robot}_Groundtruth.dat"
+        # Lines "time x y theta" in s, m and rad, up to a hundred a second in the real files.
+        table = np.zeros((0, 4))
+        if path.is_file():
+            table = LineReader(path).table("time x y heading")
         frame = pd.DataFrame(table, columns=["time", *POSE])
         frame.insert(1, "robot", robot)
         truths.append(frame)
-    table_of_events = make_events(events)
+    table_of_events = pd.concat(events)
+    # A stable sort, so that events of one time keep their order.
+    table_of_events = table_of_events.sort_values(
+        "time", kind="stable", ignore_index=True
+    )
     # All clocks are set to one server's, which counts seconds since 1970.
     origin = float(table_of_events["time"].iloc[0])
     table_of_events["time"] -= origin
@@ -101,8 +111,11 @@ def _read_barcodes(path: Path) -> dict[int, str]:
     return subjects
 
 
-def _read_landmarks(path: Path) -> pd.DataFrame:
-    """Return the places of the landmarks, by subject."""
+def _read_landmarks(path: Path, subjects: list[str]) -> pd.DataFrame:
+    """Return the places of the landmarks, by subject; NaN without a file."""
+    if not path.is_file():
+        index = pd.Index(subjects, name="subject")
+        return pd.DataFrame(np.nan, index=index, columns=["x", "y"])
     # The standard deviations of the survey, below a millimetre, are left out.
     table = LineReader(path).table("subject x y x_std y_std")
     index = pd.Index([str(int(subject)) for subject in table[:, 0]], name="subject")
@@ -110,7 +123,7 @@ def _read_landmarks(path: Path) -> pd.DataFrame:
 
 
 def _find_robots(root: Path) -> list[str]:
-    """Return the robots' numbers; each must have all three files."""
+    """Return the robots' numbers; each must have odometry and measurements."""
     found: dict[str, set[str]] = {}
     for path in sorted(root.glob("Robot*_*.dat")):
         # Robot3_Odometry: robot 3, kind Odometry.
@@ -121,7 +134,7 @@ def _find_robots(root: Path) -> list[str]:
             f"{root}: no file Robot1_Odometry.dat, so that no robot is found"
         )
     for robot, kinds in found.items():
-        for kind in ("Odometry", "Measurement", "Groundtruth"):
+        for kind in ("Odometry", "Measurement"):
             if kind not in kinds:
                 raise DataError(f"{root / f'Robot{robot}_{kind}.dat'}: no such file")
     # Robot 10 comes after robot 9: shorter names first.
@@ -130,26 +143,23 @@ def _find_robots(root: Path) -> list[str]:
 
 def _read_measurements(
     path: Path, robot: str, barcodes: dict[int, str], unknown: str
-) -> tuple[list[Event], int]:
+) -> tuple[pd.DataFrame, int]:
     """Return a robot's observations, and how many were left out."""
     reader = LineReader(path)
     # Lines "time barcode r b" in s, m and rad, the bearing counterclockwise from straight ahead.
     table = reader.table("time barcode range bearing")
-    events: list[Event] = []
-    dropped = 0
-    for (number, _), (time, barcode, distance, bearing) in zip(
-        reader.lines, table.tolist(), strict=True
-    ):
-        subject = barcodes.get(int(barcode))
-        if subject is None:
-            if unknown == "raise":
-                raise reader.error(
-                    number,
-                    f"barcode {int(barcode)} is not in Barcodes.dat (unknown='drop' leaves "
-                    "such observations out)",
-                )
-            dropped += 1
-            continue
-        values = (distance, bearing)
-        events.append((time, robot, "range_bearing", subject, values, None))
-    return events, dropped
+    barcode_numbers = table[:, 1].astype(int).tolist()
+    is_known = np.array([barcode in barcodes for barcode in barcode_numbers], bool)
+    if unknown == "raise" and not is_known.all():
+        first = int(np.argmin(is_known))
+        number, _ = reader.lines[first]
+        raise reader.error(
+            number,
+            f"barcode {barcode_numbers[first]} is not in Barcodes.dat (unknown='drop' leaves "
+            "such observations out)",
+        )
+    subjects = [barcodes[b] for b in barcode_numbers if b in barcodes]
+    # Without the column of barcodes
+    rows = table[is_known][:, [0, 2, 3]]
+    events = stack_events(rows, robot, "range_bearing", subjects)
+    return events, int((~is_known).sum())
