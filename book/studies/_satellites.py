@@ -283,15 +283,17 @@ def score_runs(
     s: Setup, name: str, result: Any, *, each_agent: bool = True
 ) -> dict[str, float]:
     """Return each run's settled error (of each agent), NEES/d, and distance of the means."""
-    # Means over the settled times
+    # Means over the settled times. A run that fails has NaN from then on, and no mean: by
+    # default xarray skips NaN, and a sum of nothing but NaN is zero.
     late = result.isel(time=s.settled)
-    error = late["total_squared_error"].mean("time").values
+    error = late["total_squared_error"].mean("time", skipna=False).values
     # Squared distance of the agents' means from their common mean
-    deviations = late["mean"] - late["mean"].mean("agent")
-    distances = (deviations**2).sum("component").mean(("time", "agent")).values
+    deviations = late["mean"] - late["mean"].mean("agent", skipna=False)
+    squares = (deviations**2).sum("component", skipna=False)
+    distances = squares.mean(("time", "agent"), skipna=False).values
     # NEES per component, 1 for a consistent filter
     nees = (
-        late["nees"].mean(("time", "agent")).values / s.model.dim
+        late["nees"].mean(("time", "agent"), skipna=False).values / s.model.dim
         if "nees" in late
         else None
     )
@@ -345,8 +347,8 @@ def time_columns(s: Setup, name: str) -> list[str]:
 
 def step_series(s: Setup, name: str, result: Any) -> dict[str, float]:
     """Mean over a batch's runs of every agent's squared error, at all steps."""
-    # (T, A), means over the runs
-    error = result["total_squared_error"].mean("run").values
+    # (T, A), means over the runs; with a failed run there is none.
+    error = result["total_squared_error"].mean("run", skipna=False).values
     return {
         f"{name}_{a}_t{k:03d}": round_six(error[k, i])
         for k in range(error.shape[0])

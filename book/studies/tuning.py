@@ -75,9 +75,10 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
             late = satellites.run_filter(s, f, for_filters, truth, seen).isel(
                 time=s.settled
             )
-            # Settled means over the agents, NEES per component
-            error = late["total_squared_error"].mean(("time", "agent")).values
-            nees = late["nees"].mean(("time", "agent")).values / s.model.dim
+            # Settled means over the agents, NEES per component; NaN where a run failed
+            means = late.mean(("time", "agent"), skipna=False)
+            error = means["total_squared_error"].values
+            nees = means["nees"].values / s.model.dim
             for k in range(len(GAINS)):
                 metrics[f"{table}_{name}_g{k}_mse"] = float(error[k])
                 metrics[f"{table}_{name}_g{k}_nees"] = float(nees[k])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -95,3 +98,59 @@ def test_other_inputs_have_the_data_of_the_figure(batch: int) -> None:
         np.array_equal(a[:, : figure.BATCH], b)
         for a, b in zip(seen, seen_first, strict=True)
     )
+
+
+def scores_with_a_failure(failed_step: int) -> dict[str, Any]:
+    """Return the scores of two runs; the second one fails in a step, if there is such a step."""
+    setup = figure.SETUP
+    times = setup.times[:8]
+    short = replace(setup, times=times, settled=times > times[3], members=20)
+    truth, seen = satellites.draw_data(short, np.random.default_rng(0), (2,))
+
+    @updates.update
+    def fail_once(
+        ensemble: np.ndarray,
+        predicted: np.ndarray,
+        observed: np.ndarray,
+        noise: np.ndarray,
+        *,
+        rng: np.random.Generator,
+    ) -> np.ndarray:
+        analysis = updates.enkf(ensemble, predicted, observed, noise, rng=rng)
+        is_failed = (observed > 1e100).any(axis=-1)
+        return np.where(is_failed[..., None, None], np.nan, analysis)
+
+    if failed_step < len(times):
+        seen[0][failed_step, 1] = 1e200
+    f = EnsembleFilter(
+        short.model,
+        short.sensors,
+        short.graph,
+        update=fail_once,
+        members=short.members,
+        names=short.names,
+        on_error="keep",
+    )
+    run = satellites.run_filter(short, f, np.random.SeedSequence(1), truth, seen)
+    names = satellites.score_columns(short, "case", 2)
+    scores = satellites.score_runs(short, "case", run)
+    assert set(scores) == set(names)
+    return scores | satellites.step_series(short, "case", run)
+
+
+# Before the settled times, among them, and never
+@pytest.mark.parametrize("failed_step", [2, 6, 8])
+def test_a_failed_run_has_no_score(failed_step: int) -> None:
+    """Neither zero, nor the mean of the times before it failed."""
+    scores = scores_with_a_failure(failed_step)
+    without = scores_with_a_failure(8)
+    first = {name for name in scores if name.endswith("_0")}
+    second = {name for name in scores if name.endswith("_1")}
+    assert len(first) == len(second) == 5
+    for name in first:
+        assert scores[name] == pytest.approx(without[name])
+    is_failure = failed_step < 8
+    assert all(np.isnan(scores[name]) == is_failure for name in second)
+    # Means over the runs exist until then.
+    for k in range(8):
+        assert np.isnan(scores[f"case_A_t{k:03d}"]) == (k >= failed_step)

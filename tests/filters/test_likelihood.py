@@ -15,6 +15,7 @@ from distfilt.filters import (
     ParticleFilter,
     PolynomialBasis,
 )
+from distfilt.filters.likelihood import _Products
 from distfilt.network import (
     Faults,
     average_consensus,
@@ -27,6 +28,7 @@ from tests.filters.families import PRIOR, TIMES, data, model, still_model, team
 
 NET = graphs.path(5)
 QUADRATIC = PolynomialBasis([0, 1])
+LINEAR = PolynomialBasis([0, 1], degree=1)
 
 
 def make(cls: Any, **options: Any) -> Any:
@@ -45,20 +47,85 @@ def last_of(f: Any, seen: Any, runs: tuple[int, ...] = ()) -> Any:
     return last
 
 
-def test_quadratic_likelihoods_are_exact() -> None:
+@pytest.mark.parametrize(("basis", "n_numbers"), [(LINEAR, 5), (QUADRATIC, 14)])
+def test_linear_sensors_are_exact(basis: PolynomialBasis, n_numbers: int) -> None:
     """With an exact average the same weights as those of a filter of all observations.
 
     Both draw the same numbers, so that the particles are the same too.
     """
     sensors = team()
     _, seen = data(sensors, (2,))
-    a = last_of(make(LikelihoodConsensusFilter), seen, (2,))
+    a = last_of(make(LikelihoodConsensusFilter, basis=basis), seen, (2,))
     b = last_of(make(ParticleFilter), seen, (2,))
     # The same ancestors and the same noise
     assert np.allclose(a.particles, b.particles, atol=1e-9)
     assert np.allclose(a.weights, b.weights, atol=1e-9)
-    # Five monomials of degree one and two on each link and round.
-    assert (a.ledger.scalars == 5 * a.ledger.messages).all()
+    # The monomials up to twice the degree, on each link and round
+    assert (a.ledger.scalars == n_numbers * a.ledger.messages).all()
+
+
+def range_team() -> tuple[list[Any], np.ndarray, list[np.ndarray]]:
+    """Return eight sensors of distance on a ring, a track, and 20 runs of their observations.
+
+    For the first four steps only two opposite sensors are active, which cannot tell the target
+    from its mirror image; then all are.
+    """
+    angles = 2 * np.pi * np.arange(8) / 8
+    places = 5 * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    sensors = [distance([0, 1], std=0.5, origin=place) for place in places]
+    times = np.arange(8)
+    track = np.stack([1.0 + 0.1 * times, 2.0 - 0.1 * times], axis=-1)
+    rng = default_rng(7)
+    observations = []
+    for k, sensor in enumerate(sensors):
+        y = sensor.observe(np.broadcast_to(track[:, None], (8, 20, 2)), rng=rng)
+        if k not in (0, 4):
+            y[:4] = np.nan
+        observations.append(y)
+    return sensors, track, observations
+
+
+def test_a_mirror_image_costs_no_more_than_at_a_centre() -> None:
+    """The agents' particles differ, and the last ones of a cloud lie outside another's.
+
+    A polynomial that is fitted to the log-likelihood rises there without bound, and gave one
+    particle all the weight: at degree four the error was seven times the centre's.
+    """
+    sensors, track, observations = range_team()
+    prior = ([0.0, 0.0], 9 * np.eye(2))
+    options: dict[str, Any] = {"members": 500, "jitter": 0.05}
+    walk = still_model(2, 0.3)
+    ring = graphs.ring(8)
+    centre = ParticleFilter(walk, sensors, ring, hops="all", **options)
+    consensus = LikelihoodConsensusFilter(
+        walk, sensors, ring, basis=QUADRATIC, fusion=finite_time_consensus, **options
+    )
+    scores = {}
+    for name, f in (("centre", centre), ("consensus", consensus)):
+        start = f.start(prior, rng=default_rng(1), runs=(20,))
+        truth = np.broadcast_to(track[:, None], (8, 20, 2))
+        run = f.run(start, 1.0 + np.arange(8), observations, truth=truth)
+        late = run.isel(time=slice(5, None))
+        error = late["total_squared_error"].values.mean()
+        scores[name] = np.sqrt(error), late["nees"].values.mean() / 2
+    assert scores["consensus"][0] < 1.15 * scores["centre"][0]
+    assert scores["consensus"][1] < 1.3
+
+
+def test_an_approximated_residual_never_rewards_a_particle() -> None:
+    """Wherever it is evaluated: -½ Σ (c' φ)² is at most zero, up to the dropped constant."""
+    rng = default_rng(0)
+    basis = PolynomialBasis([0, 1], degree=2)
+    products = _Products(basis, 5)
+    coefficients = rng.standard_normal((6, 3))
+    far = 20 * rng.standard_normal((1000, 2))
+    functions = basis(far)
+    ones = np.ones((1000, 1))
+    residuals = np.concatenate([ones, functions], axis=-1) @ coefficients
+    values = products.evaluate(functions) @ products.expand_squares(coefficients)
+    constant = -0.5 * (coefficients[0] ** 2).sum()
+    assert products.size == 14
+    assert np.allclose(values + constant, -0.5 * (residuals**2).sum(axis=-1))
 
 
 def test_few_rounds_are_close_and_more_are_closer() -> None:
@@ -104,6 +171,44 @@ def test_higher_degrees_follow_curved_sensors() -> None:
         errors.append(np.abs(f.summarize(state).mean - expected.mean).max())
     assert errors[0] > 4 * errors[1] > 16 * errors[2]
     assert errors[2] < 1e-3
+
+
+def test_ranges_have_the_weights_of_all_observations() -> None:
+    """Particles that do not move, with weights ∝ exp(-½ Σ (y - |x - p|)² / σ²) by hand.
+
+    A range r = |x - p| has a Taylor series in x / |p|, here of up to a third: two degrees more
+    divide the error of each weight by about nine. A wrong factor or shift of the sum would stay.
+    """
+    places = [[-6.0, 1.0], [0.5, -7.0], [8.0, 2.0], [-1.0, 6.0], [5.0, 5.0]]
+    stds = [0.5, 0.7, 0.6, 0.9, 0.8]
+    observed = [6.4, 7.1, 7.9, 5.6, 6.3]
+    sensors: list[Any] = []
+    for place, std in zip(places, stds, strict=True):
+        sensors.append(distance([0, 1], std=std, origin=place))
+    errors = []
+    for degree in (2, 4, 6):
+        f = make(
+            LikelihoodConsensusFilter,
+            sensors=sensors,
+            members=500,
+            basis=PolynomialBasis([0, 1], degree=degree),
+            model=still_model(2),
+            jitter=0.0,
+        )
+        start = f.start(([0.0, 0.0], 0.3 * np.eye(2)), rng=default_rng(1))
+        state = f.step(start, 1.0, [[y] for y in observed])
+        # Each agent has particles of its own, and the observations of all.
+        logs = np.zeros((5, 500))
+        for y, place, std in zip(observed, places, stds, strict=True):
+            ranges = np.linalg.norm(state.particles - place, axis=-1)
+            logs -= 0.5 * ((y - ranges) / std) ** 2
+        weights = np.exp(logs) / np.exp(logs).sum(axis=-1, keepdims=True)
+        # For particles that matter
+        is_relevant = weights > 1e-3 * weights.max(axis=-1, keepdims=True)
+        ratio = state.weights[is_relevant] / weights[is_relevant]
+        errors.append(np.abs(ratio - 1).max())
+    assert errors[0] > 4 * errors[1] > 16 * errors[2]
+    assert errors[2] < 0.01
 
 
 def test_the_centre_and_scale_of_the_basis_do_not_matter_to_a_fit() -> None:
