@@ -220,6 +220,8 @@ def driver(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     with chromium(profile, performance="ALL", browser="ALL") as browser_driver:
         # axe needs some seconds for a long page, more where other programs run.
         browser_driver.set_script_timeout(300)
+        # The answer to a call must not be given up before the script is.
+        browser_driver.command_executor.client_config.timeout = 330
         # The page behaves as if it had the focus, also in a headless browser.
         browser_driver.execute_cdp_cmd(
             "Emulation.setFocusEmulationEnabled", {"enabled": True}
