@@ -4,6 +4,14 @@ A difference over a step h has two errors: rounding of the function's values, ab
 and curvature within the step. The usual step, 6e-6 of a component's size, balances them for
 functions in double precision whose values are about as large as their changes. Where rounding
 counts (values in single precision, a large constant in them), longer steps are tried too.
+
+Shapes and words of this module: for states x (..., d) and values f(x) (..., m) a *slope* is an
+entry ∂f_j/∂x_i of an array (..., d, m), the Jacobian transposed. A *row* is a row of the Jacobian,
+all slopes of one value: its entries are compared after multiplication by the standard deviation of
+each component of the state, which makes them changes of the value, in its own units. Arguments
+that all functions share are the user's `function` on (..., d) to (..., m), the states `x`, a
+function `difference` that subtracts values, such as angles that wrap, and `deviation`, the standard
+deviations (..., d).
 """
 
 from __future__ import annotations
@@ -25,13 +33,18 @@ __all__: list[str] = []
 _STEP = 6e-6
 # Steps below this are not refined further.
 _SMALLEST_STEP = 1e-10
-# Factor between the steps of a ladder.
+# Each longer step is so many times the last one: the longest is reached in a few, and a second
+# difference grows by the square, 256, which tells curvature from noise.
 _RATIO = 16
-# Rounding error of a slope, relative to its row, above which longer steps are tried.
+# Largest number of steps that are tried: with this ratio they reach from 6e-6 to 1e14.
+_MOST_STEPS = 16
+# Error of a slope, relative to its row, that does no harm in a filter.
 _NEGLIGIBLE = 1e-7
-# The same for a second difference, the visible sign of noise.
+# Second difference, relative to the row, above which longer steps are tried. A smooth function's
+# is of the order of the step, 6e-6; noise makes a larger one.
 _VISIBLE = 1e-3
-# A step's rounding error is at most so many units of the values' precision, over the step.
+# The difference of two values with noise n is up to 2 n off, and the slope n / h. So many times
+# that is taken for a bound, since n is an estimate.
 _MARGIN = 4.0
 
 
@@ -47,34 +60,40 @@ class HasDerivative(Protocol):
 
 @dataclass(eq=False)
 class _Differences:
-    """Differences of a function (..., m) over one step in each of d components, (..., d, m)."""
+    """Differences of a function (..., m) over a step h in each of d components of the state."""
 
+    # The step h of each component, (..., d).
     step: Array
+    # (f(x + h) - f(x - h)) / (2 h), its numerator, and f(x + h) - 2 f(x) + f(x - h), (..., d, m).
     slope: Array
     change: Array
     bend: Array
+    # The function's values f(x) between the two steps, (..., 1, m).
     centre: Array
     # Relative precision of the values, (m,).
     precision: Array
-    # Where the function bends within the step but not within a shorter one, (..., d, m): that
-    # is curvature. Noise looks bent over any step.
+    # Where the function bends within this step but is straight within a shorter one, (..., d, m):
+    # there the bend is curvature. Rounding noise looks bent over steps of any length.
     has_curvature: Mask | bool = False
 
     @property
     def is_bent(self) -> Mask:
-        """Whether the function bends within the step, beyond rounding, (..., d, m)."""
-        # In single precision the bend may be rounding alone.
+        """Whether the function bends within the step, beyond rounding, (..., d, m).
+
+        A bend of one percent of the change over both steps, 2 h, is visible. It is compared with
+        the change of all values by this component of the state, and with the change of this value
+        by any component: a bend that is small beside both does no harm.
+        """
+        # A bend may be rounding of values that have lost six digits, or of single precision.
         unit = np.maximum(1e-9, 8 * self.precision)
         rounding = unit * np.abs(self.centre)
         bend = np.abs(self.bend)
-        # Beside the largest change of all values by this component's step,
         largest_change = np.abs(self.change).max(axis=-1)
         limit = 1e-2 * largest_change + rounding.max(axis=-1)
-        column_is_bent = bend.max(axis=-1) > limit
-        # and of one value, beside its steepest slope in any component.
+        component_is_bent = bend.max(axis=-1) > limit
         steepest = np.abs(self.slope).max(axis=-2, keepdims=True)
         entry_is_bent = bend > 2e-2 * steepest * self.step[..., None] + rounding
-        return np.asarray(column_is_bent[..., None] | entry_is_bent)
+        return np.asarray(component_is_bent[..., None] | entry_is_bent)
 
 
 def central_difference(
@@ -134,40 +153,53 @@ def difference_with_error(
     """Derivative as :func:`central_difference`, and a bound of its rounding error, (..., m, d)."""
     size = np.maximum(1.0, np.abs(x))
     deviation = size if scale is None else np.broadcast_to(scale, x.shape)
-    first, slope, error = _refine(function, x, difference, step)
-    if scale is not None and ((first.step > deviation) & (deviation > 0)).any():
-        slope = _shorten(function, x, difference, first, slope, deviation)
-    if _is_rough(first, error, deviation):
-        slope, error = _climb(function, x, difference, first, (slope, error), deviation)
+    first, slope, error = _refine_differences(function, x, difference, step)
+    is_long = (first.step > deviation) & (deviation > 0)
+    if scale is not None and is_long.any():
+        slope = _shorten_steps(function, x, difference, first, slope, deviation)
+    if _may_be_noisy(first, error, deviation):
+        slope, error = _lengthen_steps(
+            function, x, difference, first, (slope, error), deviation
+        )
+    # Jacobians have the values first.
     return np.asarray(slope.mT), np.asarray(error.mT)
 
 
-def _refine(
+def _refine_differences(
     function: Callable[[Array], Array],
     x: Array,
     difference: Callable[[Array, Array], Array],
     step: float,
 ) -> tuple[_Differences, Array, Array]:
-    """Return the differences of a step, and slopes and errors, refined where they bend."""
-    first = _take_differences(
-        function, x, difference, step * np.maximum(1.0, np.abs(x))
-    )
+    """Take differences over a step, and over shorter steps where the function bends within it.
+
+    `step` is relative to a component's size, or to 1 if that is larger. The first result has the
+    differences of this step. The other two, (..., d, m), are slopes and their errors: of this step,
+    or, where the function bends, of one that is a hundred times as short, and so on.
+    """
+    size = np.maximum(1.0, np.abs(x))
+    first = _take_differences(function, x, difference, step * size)
     error = _rounding_error(first, x)
     is_bent = first.is_bent
     if not is_bent.any():
         return first, first.slope, error
     if step <= _SMALLEST_STEP:
-        # Nothing is left to compare with: what bends here may be noise.
+        # There is no shorter step that could show whether the bend is curvature or noise, so it
+        # counts as an error of the slope.
         bend = np.abs(first.bend) / first.step[..., None]
         return first, first.slope, np.where(is_bent, np.maximum(error, bend), error)
-    second, finer, finer_error = _refine(function, x, difference, 1e-2 * step)
+    # The shorter step is refined in the same way.
+    second, finer, finer_error = _refine_differences(
+        function, x, difference, 1e-2 * step
+    )
+    # A change of exactly zero says nothing: the step may be below the function's resolution.
     is_straight = ~second.is_bent & (second.change != 0)
     first.has_curvature = is_bent & (is_straight | second.has_curvature)
     slope = np.where(is_bent, finer, first.slope)
     return first, slope, np.where(is_bent, finer_error, error)
 
 
-def _shorten(
+def _shorten_steps(
     function: Callable[[Array], Array],
     x: Array,
     difference: Callable[[Array, Array], Array],
@@ -175,13 +207,14 @@ def _shorten(
     slope: Array,
     deviation: Array,
 ) -> Array:
-    """Return slopes within the standard deviations, where longer steps contradict them.
+    """Replace slopes of steps longer than a standard deviation that a shorter step contradicts.
 
-    A phase that turns many times within a step may look straight by chance.
+    A phase that turns many times within a step may look straight by chance. Slopes are (..., d, m).
     """
     is_long = (first.step > deviation) & (deviation > 0)
     h = np.where(is_long, 0.5 * deviation, first.step)
     short = _take_differences(function, x, difference, h)
+    # Differences below one percent of the steepest slope are curvature, which does no harm.
     steepest = np.abs(short.slope).max(axis=-2, keepdims=True)
     limit = 1e-2 * steepest + _rounding_error(short, x)
     differs = is_long[..., None] & (np.abs(short.slope - slope) > limit)
@@ -194,18 +227,19 @@ def _take_differences(
     difference: Callable[[Array, Array], Array],
     h: Array,
 ) -> _Differences:
-    """Return the differences over steps `h` (..., d) to both sides."""
+    """Return the differences over steps `h` (..., d) to both sides of states x (..., d)."""
+    # Row i moves component i alone: all d states are evaluated in one call.
     steps = h[..., None] * np.eye(x.shape[-1])
     ahead = x[..., None, :] + steps
     behind = x[..., None, :] - steps
-    # After rounding the true step is the difference of the two states.
+    # x + h is rounded: the true step, 2 h, is the difference of the two states.
     true_steps = np.diagonal(ahead - behind, axis1=-2, axis2=-1)
     f_ahead = np.asarray(call_user(function, ahead))
     f_behind = np.asarray(call_user(function, behind))
     f_centre = np.asarray(call_user(function, x[..., None, :]))
     change = call_user(difference, f_ahead, f_behind)
 
-    # Second differences f(x + h) - 2 f(x) + f(x - h) vanish where the function is straight.
+    # The bend is f(x + h) - 2 f(x) + f(x - h), which is zero where the function is straight.
     upper_half = call_user(difference, f_ahead, f_centre)
     lower_half = call_user(difference, f_behind, f_centre)
     return _Differences(
@@ -221,10 +255,11 @@ def _take_differences(
 def _precision(*values: Array) -> Array:
     """Return the relative precision ε in which values (..., m) were computed, (m,).
 
-    Numbers that are exact in single precision were computed in it: after a step of 6e-6 in
-    double precision none would be.
+    Numbers that are exact in single precision were computed in it: of double-precision values at
+    shifted states, all would be so by a rare chance only.
     """
     is_single = np.ones(values[0].shape[-1], dtype=bool)
+    # Numbers outside the range of single precision become infinite or zero, and so differ.
     with np.errstate(over="ignore", invalid="ignore", under="ignore"):
         for value in values:
             rows = value.reshape(-1, value.shape[-1])
@@ -234,32 +269,49 @@ def _precision(*values: Array) -> Array:
     return np.asarray(np.where(is_single, single, np.finfo(np.float64).eps))
 
 
-def _noise(differences: _Differences, x: Array, slope: Array) -> Array:
-    """Return the noise of the function's values by rounding, (..., 1, m)."""
-    # The values' own rounding ε|f|, and that of the states within the function, ε|J x|.
+def _rounding_noise(differences: _Differences, x: Array, slope: Array) -> Array:
+    """Return the noise of the function's values by rounding, (..., 1, m).
+
+    It is the values' own rounding ε |f|, and that of the states x within the function, of which
+    the largest ε |∂f/∂x_i| |x_i| counts. `slope` (..., d, m) has the derivatives.
+    """
     through_states = (np.abs(slope) * np.abs(x)[..., None]).max(axis=-2, keepdims=True)
     noise = differences.precision * (np.abs(differences.centre) + through_states)
     return np.asarray(noise)
 
 
 def _rounding_error(differences: _Differences, x: Array) -> Array:
-    """Return a bound of the slopes' rounding error, (..., d, m)."""
-    noise = _noise(differences, x, differences.slope)
+    """Return a bound of the slopes' rounding error, the noise of the values over h, (..., d, m)."""
+    noise = _rounding_noise(differences, x, differences.slope)
     return np.asarray(_MARGIN * noise / differences.step[..., None])
 
 
-def _is_rough(first: _Differences, error: Array, deviation: Array) -> bool:
-    """Whether rounding may spoil a slope, as far as the row's change over a deviation shows."""
+def _largest_in_row(slope: Array, deviation: Array) -> Array:
+    """Return how far each value changes within a standard deviation of the state, (..., 1, m).
+
+    Of the changes |∂f/∂x_i| s_i by the components, with the deviations s (..., d), the largest.
+    """
+    return np.asarray(
+        (np.abs(slope) * deviation[..., None]).max(axis=-2, keepdims=True)
+    )
+
+
+def _may_be_noisy(first: _Differences, error: Array, deviation: Array) -> bool:
+    """Whether noise of the values may spoil a slope, beside the other slopes of its row.
+
+    `error` (..., d, m) is the bound of the slopes' errors by :func:`_rounding_error`.
+    """
     weight = deviation[..., None]
-    # How far the function changes within a standard deviation of the state.
-    row = (np.abs(first.slope) * weight).max(axis=-2, keepdims=True)
+    row = _largest_in_row(first.slope, deviation)
+    # Such a bound is _MARGIN times the error that noise makes.
     by_rounding = error * weight > _MARGIN * _NEGLIGIBLE * row
     # A smooth function in double precision hardly bends within such a step.
     bend = 0.5 * np.abs(first.bend) / first.step[..., None]
-    return bool((by_rounding | (bend * weight > _VISIBLE * row)).any())
+    by_bending = bend * weight > _VISIBLE * row
+    return bool((by_rounding | by_bending).any())
 
 
-def _climb(
+def _lengthen_steps(
     function: Callable[[Array], Array],
     x: Array,
     difference: Callable[[Array, Array], Array],
@@ -271,54 +323,62 @@ def _climb(
 
     O. V. Lepski's rule, for each entry: a step is too long as soon as its slope differs from a
     shorter step's by more than the rounding of both. Slopes that rounding does not spoil stay.
+    `result` has slopes and errors (..., d, m) of the step `first`, or of shorter ones.
     """
     slope, error = result
     size = np.maximum(1.0, np.abs(x))
-    # Half a standard deviation; at least a hundredth of the size, for functions in single
-    # precision whose states are known well. A component without uncertainty needs no slope.
-    top = np.where(deviation > 0, np.maximum(0.5 * deviation, 1e-2 * size), 0.0)
+    # The longest step is half a standard deviation. For functions in single precision and small
+    # deviations it is a hundredth of the component's size, or rounding would decide. A component
+    # without uncertainty needs no slope.
+    longest = np.where(deviation > 0, np.maximum(0.5 * deviation, 1e-2 * size), 0.0)
+    # Slopes of the steps so far, with bounds of their errors.
     tried: list[tuple[Array, Array]] = []
     agrees = np.ones(slope.shape, dtype=bool)
     noise: Array = np.zeros(())
     h = first.step
-    while (h < top).any() and len(tried) < 16:
-        h = np.where(h < top, np.minimum(_RATIO * h, np.maximum(top, first.step)), h)
+    while (h < longest).any() and len(tried) < _MOST_STEPS:
+        next_step = np.minimum(_RATIO * h, np.maximum(longest, first.step))
+        h = np.where(h < longest, next_step, h)
         longer = _try_differences(function, x, difference, h)
         if longer is None:
             break
         if not tried:
             noise = _noise_of_two_steps(first, longer, x)
-            tried.append((first.slope, _MARGIN * noise / first.step[..., None]))
-            # Where refining has followed a bend, and no noise, longer steps are no use.
-            agrees = (slope == first.slope) | (noise > 8 * _noise(first, x, slope))
+            first_bound = _MARGIN * noise / first.step[..., None]
+            tried.append((first.slope, first_bound))
+            # Only with two steps is the noise known, and with it the first step's error.
+            is_first = slope == first.slope
+            error = np.where(is_first, first_bound, error)
+            # Longer steps are of use only where the first slope was kept, or where the bend for
+            # which a shorter step was taken was noise, far more than rounding, and not curvature.
+            agrees = is_first | (noise > 8 * _rounding_noise(first, x, slope))
         bound = _MARGIN * noise / longer.step[..., None]
-        for shorter, its_bound in tried:
+        for shorter_slope, shorter_bound in tried:
             # NaN, where the function has no value, agrees with nothing.
-            agrees = agrees & (np.abs(longer.slope - shorter) <= bound + its_bound)
+            distance = np.abs(longer.slope - shorter_slope)
+            agrees = agrees & (distance <= bound + shorter_bound)
         tried.append((longer.slope, bound))
-        chosen = agrees
-        if len(tried) == 2:
-            # The first step's error is now known better.
-            error = np.where(slope == first.slope, tried[0][1], error)
-        slope = np.where(chosen, longer.slope, slope)
-        error = np.where(chosen, bound, error)
+        slope = np.where(agrees, longer.slope, slope)
+        error = np.where(agrees, bound, error)
         if not agrees.any() or _is_accurate(slope, error, deviation):
             break
-    return _keep_close(result[0], slope, deviation), error
+    return _restore_close(result[0], slope, deviation), error
 
 
 def _is_accurate(slope: Array, error: Array, deviation: Array) -> bool:
-    """Whether the rounding of all slopes is negligible beside their rows."""
-    weight = deviation[..., None]
-    row = (np.abs(slope) * weight).max(axis=-2, keepdims=True)
-    return bool((error * weight <= 1e-2 * _NEGLIGIBLE * row).all())
+    """Whether the errors of all slopes are at most a hundredth of a negligible one."""
+    row = _largest_in_row(slope, deviation)
+    is_accurate = error * deviation[..., None] <= 1e-2 * _NEGLIGIBLE * row
+    return bool(is_accurate.all())
 
 
-def _keep_close(old: Array, new: Array, deviation: Array) -> Array:
-    """Return new slopes, but the old ones where the difference is negligible beside the row."""
-    weight = deviation[..., None]
-    row = (np.abs(new) * weight).max(axis=-2, keepdims=True)
-    is_close = np.abs(new - old) * weight <= _NEGLIGIBLE * row
+def _restore_close(old: Array, new: Array, deviation: Array) -> Array:
+    """Return new slopes, but the old ones where the difference is negligible beside the row.
+
+    So the slopes of a function without noise do not depend on the longer steps at all.
+    """
+    row = _largest_in_row(new, deviation)
+    is_close = np.abs(new - old) * deviation[..., None] <= _NEGLIGIBLE * row
     return np.where(is_close, old, new)
 
 
@@ -328,7 +388,7 @@ def _try_differences(
     difference: Callable[[Array, Array], Array],
     h: Array,
 ) -> _Differences | None:
-    """Return the differences over longer steps; None where the function does not reach so far."""
+    """Return the differences over steps h (..., d); None if the function does not reach so far."""
     # Beyond its domain a function may warn, return NaN, or raise.
     with (
         suppress(ArithmeticError, LookupError, RuntimeError, ValueError),
@@ -343,16 +403,19 @@ def _noise_of_two_steps(short: _Differences, long: _Differences, x: Array) -> Ar
     """Return the noise of the values (..., 1, m), from precision and from second differences.
 
     Curvature makes a second difference 256 times as large over 16 times the step; noise leaves
-    it as it is.
+    it as it is. In between, less than 64 times as large counts as noise.
     """
     steepest = np.maximum(np.abs(short.slope), np.abs(long.slope))
-    rounding = _noise(short, x, steepest)
+    rounding = _rounding_noise(short, x, steepest)
     bend = np.abs(short.bend)
-    # What bends over every step, however short, is noise too.
+    # A second difference is noise if it hardly grows with the step, and either is small beside the
+    # value or was large enough for shorter steps to be taken. Where those showed curvature, it is
+    # none.
+    hardly_grows = np.abs(long.bend) < 64 * bend
     is_small = bend < 1e-3 * np.abs(short.centre)
-    is_noise = (np.abs(long.bend) < 64 * bend) & (is_small | short.is_bent)
+    is_noise = hardly_grows & (is_small | short.is_bent)
     is_noise &= ~np.asarray(short.has_curvature)
-    # Slopes of the shortest step include the noise that is to be found.
+    # The largest over the components: each shows the noise of the same values.
     visible = np.where(is_noise, bend, 0.0).max(axis=-2, keepdims=True)
     return np.asarray(np.maximum(rounding, visible))
 
@@ -371,9 +434,10 @@ def evaluate_derivative(
     """Call an owner's `derivative`, or take differences if it has none; return (..., m, d).
 
     The first time the derivative is compared with differences, since a transposed one may have the
-    right shape too. Rows may be a tenth of their largest entry off, and may lack entries that are
-    negligible beside the other rows. Differences that cannot be trusted doubt no derivative, and
-    a warning is given, once, where one of them has to be used.
+    right shape too, and a warning is given if an entry is off by more than a tenth of the largest
+    in its row. Entries that are negligible beside the other rows may be missing. Differences that
+    depend on their step prove nothing against a derivative; where such differences have to be used
+    in its place, a warning is given, once.
 
     Parameters
     ----------
@@ -382,10 +446,11 @@ def evaluate_derivative(
     args, shape : tuple
         Arguments of the derivative, whose arrays are copied, and the shape of the result.
     differences : callable
-        ``differences(step=step)`` by :func:`difference_with_error`. Rows that depend on the step
-        are not compared.
+        ``differences(step=step)``, :func:`difference_with_error` of the owner's function, which
+        returns slopes and errors (..., m, d). Rows that depend on the step are not compared.
     static : ndarray, optional
-        The derivative of a state that does not change; it is subtracted before comparing.
+        The derivative of a function that changes nothing, I for a transition. A row's size is that
+        of its difference from this, so that small changes of the state are compared too.
     name : str
         Name of the function, for the warning.
     scale : ndarray, (..., d), optional
@@ -443,12 +508,17 @@ def needs_differences(owner: HasDerivative) -> bool:
 
 
 def _is_uncertain(slope: Array, error: Array, scale: Array, tolerance: Array) -> bool:
-    """Whether errors of slopes change predictions by a tenth of their row and of the noise."""
+    """Whether errors of a Jacobian matter: a tenth of the change in their row and of the noise.
+
+    Jacobian and errors are (..., m, d). An error times the state's deviation, `scale` (..., d), is
+    an error of a prediction. It does no harm if it is small beside the largest change of the
+    prediction, or beside the deviation of its noise, `tolerance` (..., m).
+    """
     weight = np.broadcast_to(scale, slope.shape[:-2] + slope.shape[-1:])[..., None, :]
     row = (np.abs(slope) * weight).max(axis=-1, keepdims=True)
-    allowed = np.asarray(tolerance)[..., None]
-    # A known constant has no deviation with which an error could be compared.
-    limit = np.where(allowed > 0, 0.1 * np.maximum(row, allowed), np.inf)
+    noise_std = np.asarray(tolerance)[..., None]
+    # A value without noise has no deviation with which an error could be compared.
+    limit = np.where(noise_std > 0, 0.1 * np.maximum(row, noise_std), np.inf)
     return bool((error * weight > limit).any())
 
 
@@ -457,25 +527,37 @@ def _contradicts(
     differences: Callable[..., tuple[Array, Array]],
     static: Array | float,
 ) -> bool:
-    """Whether a derivative differs from differences that do not depend on their step."""
+    """Whether a Jacobian (..., m, d) differs from differences that do not depend on their step.
+
+    `differences` and `static` are those of :func:`evaluate_derivative`.
+    """
     reference, error = differences(step=_STEP)
     coarse, _ = differences(step=4 * _STEP)
-    is_off = _is_off(slope, reference, coarse, error, static)
-    if not is_off.any():
+    is_wrong = _find_wrong(slope, reference, coarse, error, static)
+    if not is_wrong.any():
         return False
-    # Two steps may agree by chance, as where a phase turns many times within them.
+    # Two steps may agree by chance, as where a phase turns many times within them: a much shorter
+    # step must confirm it.
     fine, fine_error = differences(step=_STEP / 64)
-    still_off = _is_off(slope, reference, fine, np.maximum(error, fine_error), static)
-    return bool((is_off & still_off).any())
+    larger_error = np.maximum(error, fine_error)
+    is_confirmed = _find_wrong(slope, reference, fine, larger_error, static)
+    return bool((is_wrong & is_confirmed).any())
 
 
-def _is_off(
+def _find_wrong(
     slope: Array, reference: Array, other: Array, error: Array, static: Array | float
 ) -> Mask:
-    """Whether entries differ from reliable differences by more than these may err."""
+    """Return which entries (..., m, d) differ from reliable differences by more than these may err.
+
+    A row of the reference is reliable if another step's differences, `other`, agree to one percent
+    of its largest entry, or to its rounding, `error`.
+    """
     row_size = np.abs(reference - static).max(axis=-1, keepdims=True)
     step_error = np.abs(reference - other).max(axis=-1, keepdims=True)
     rounding = error.max(axis=-1, keepdims=True)
     is_reliable = step_error <= 1e-2 * row_size + rounding
-    bound = 0.1 * row_size + 1e-4 * row_size.max(axis=-2, keepdims=True) + 2 * rounding
+    # A tenth of the row is allowed, for approximate derivatives, and a small part of the largest
+    # row: a derivative may leave out a small effect.
+    largest_row = row_size.max(axis=-2, keepdims=True)
+    bound = 0.1 * row_size + 1e-4 * largest_row + 2 * rounding
     return np.asarray(is_reliable & (np.abs(slope - reference) > bound))

@@ -33,7 +33,7 @@ __all__ = ["Members", "draw", "mean", "sample_covariance"]
 
 
 def _check_size(members: int, value: Array, name: str) -> None:
-    """Refuse an ensemble of fewer members."""
+    """Raise an error if an ensemble (..., N, d) has fewer members than so many."""
     if value.shape[-2] < members:
         raise ValueError(
             f"{name} must have at least {members} members, got {value.shape[-2]}"
@@ -45,9 +45,12 @@ Members = Annotated[ArrayInput, "... N d", partial(_check_size, 1)]
 Ensemble = Annotated[ArrayInput, "... N d", partial(_check_size, 2)]
 """Annotation of an argument that is an ensemble with a sample covariance."""
 
-# Pivots of unit columns up to which a singular value decomposition decides on their rank.
+# Pivots of unit columns up to which a singular value decomposition decides on their rank. Rounding
+# leaves pivots of about 1e-15; independent columns rarely have pivots below 1e-6, so that the
+# slower decomposition is rarely needed.
 _SMALL_PIVOT = 1e-6
-# Smallest diagonal entry of the Cholesky factor of a draw's covariance with which to solve.
+# Smallest diagonal entry of the Cholesky factor of a draw's covariance with which to solve: with
+# such pivots, of variances of about one, the solution loses no more than a digit.
 _SAFE_PIVOT = np.sqrt(0.1)
 
 
@@ -164,7 +167,9 @@ def match_moments(
     centre = weights @ scaled
     scaled -= centre[..., None, :]
     q, r = np.linalg.qr(scaled)
-    # The part of a component that is independent of those before it must exceed rounding.
+    # |R_kk| is the part of component k that those before it do not explain. It must exceed
+    # rounding: of the whole component, whose length is that of column k of R, and of its mean,
+    # which has been subtracted.
     length = np.sqrt((r**2).sum(axis=-2))
     independent = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
     rounding = 32 * d * EPS * (length + np.abs(centre))
@@ -209,10 +214,11 @@ def exact_noise(avoid: Array, root: Array, rng: Rng) -> Array:
 
     Notes
     -----
-    A plain draw is projected onto the complement, over the members, of the constant and of the
-    anomalies, orthonormalised, which is whitening by the Cholesky factor of its own covariance, and
-    coloured: :math:`\sqrt{N-1}\,\mathbf Q\mathbf L^\top` with :math:`\mathbf P=\mathbf L
-    \mathbf L^\top`. :math:`\mathbf Q` is distributed uniformly over the orthonormal frames there.
+    Columns of a plain draw are vectors with one entry per member. They are made orthogonal to the
+    constant vector and to the anomalies, then to each other and of unit length, which gives
+    :math:`\mathbf Q`. The noise is :math:`\sqrt{N-1}\,\mathbf Q\mathbf L^\top` with
+    :math:`\mathbf P=\mathbf L\mathbf L^\top`. No direction is preferred: :math:`\mathbf Q` is
+    distributed uniformly over the orthonormal frames of that subspace.
 
     Examples
     --------
@@ -226,6 +232,7 @@ def exact_noise(avoid: Array, root: Array, rng: Rng) -> Array:
     True
     """
     n = avoid.shape[-2]
+    # There seem to be too few members, unless the covariance is singular.
     if n <= avoid.shape[-1] + root.shape[-1]:
         root = _drop_null_columns(root)
     rank = root.shape[-1]
@@ -235,7 +242,11 @@ def exact_noise(avoid: Array, root: Array, rng: Rng) -> Array:
 
 
 def _drop_null_columns(root: Array) -> Array:
-    """Reduce a factor to as many columns as its rank, up to rounding: it needs fewer members."""
+    """Reduce a factor (..., k, r) of covariances to as many columns as their rank, up to rounding.
+
+    Noise of a lower rank needs fewer members. In a batch the rank is the largest.
+    """
+    # Rows of unit length: the factor of the correlations.
     std = np.sqrt((root**2).sum(axis=-1))
     unit = np.where(std > 0, std, 1.0)[..., None]
     # Singular values count if their squares exceed the rounding of the covariance.
@@ -243,16 +254,22 @@ def _drop_null_columns(root: Array) -> Array:
     largest = s.max(axis=-1, initial=0.0, keepdims=True)
     is_positive = s**2 > 64 * s.shape[-1] * EPS * largest**2
     rank = int(is_positive.sum(axis=-1).max(initial=0))
+    # L Lᵀ = U S² Uᵀ, so that U S is a factor too, with zero columns last.
     columns = u * (s * is_positive)[..., None, :]
     return lower_root(columns[..., :rank]) * unit
 
 
 def _project_out(noise: Array, avoid: Array) -> Array:
-    """Subtract from a draw its mean and its projection on the anomalies."""
+    """Subtract from a draw (..., N, r) its mean, and its projection on the anomalies of `avoid`.
+
+    Raises an error if there are too few members for r columns that are independent of those.
+    """
     n, rank = noise.shape[-2:]
     anomalies = center_ensemble(avoid)[1]
-    size = np.sqrt((anomalies**2).sum(axis=-2, keepdims=True))
-    basis, independent = _orthonormal_basis(anomalies / np.where(size > 0, size, 1.0))
+    length = np.sqrt((anomalies**2).sum(axis=-2, keepdims=True))
+    unit_columns = anomalies / np.where(length > 0, length, 1.0)
+    basis, independent = _orthonormal_basis(unit_columns)
+    # Of N dimensions the constant vector takes one, and the anomalies take theirs.
     if n <= independent + rank:
         raise ValueError(
             f"ensemble must have more than {independent} + {rank} members, for "
@@ -265,11 +282,17 @@ def _project_out(noise: Array, avoid: Array) -> Array:
 
 
 def _orthonormal_basis(columns: Array) -> tuple[Array, int]:
-    """Orthonormal columns, or zeros, that span unit columns (..., n, p), and the largest rank."""
+    """Return an orthonormal basis of the span of unit columns (..., n, p), and its dimension.
+
+    The basis has as many columns as the input; those that are not needed are zero. In a batch the
+    dimension is the largest.
+    """
     q, r = np.linalg.qr(columns)
+    # The diagonal of R is the part of each column that those before it do not span.
     is_independent = np.abs(np.diagonal(r, axis1=-2, axis2=-1)) > _SMALL_PIVOT
-    # A small pivot may be rounding, magnified by columns that are close to one another: to avoid
-    # its direction would cost a member, and would leave the draw to the last bit.
+    # A small part may be rounding only. Taken for a direction, it would cost a degree of freedom
+    # and make the draw depend on the last bit. The singular values of R are those of the columns
+    # and show their rank reliably; with R = U S Vᵀ the basis is Q U.
     if not is_independent.all():
         u, values, _ = np.linalg.svd(r, full_matrices=False)
         largest = values.max(axis=-1, initial=0.0, keepdims=True)
@@ -280,19 +303,24 @@ def _orthonormal_basis(columns: Array) -> tuple[Array, int]:
 
 
 def _set_covariance(noise: Array, root: Array) -> Array:
-    """Transform a draw (..., N, r) linearly so that its sample covariance is root rootᵀ."""
+    """Transform a draw (..., N, r) linearly so that its sample covariance is L Lᵀ, (..., N, k).
+
+    The draw is centred; `root` is L, (..., k, r).
+    """
     n = noise.shape[-2]
     transposed_root = root.swapaxes(-1, -2)
-    # Whitening: with Zᵀ Z / (N - 1) = C Cᵀ the sample covariance of Z C⁻ᵀ is the identity.
+    # Whitening: with Zᵀ Z / (N - 1) = C Cᵀ the sample covariance of Z C⁻ᵀ is the identity, and
+    # that of Z C⁻ᵀ Lᵀ is L Lᵀ.
     with suppress(np.linalg.LinAlgError):
         transposed = np.ascontiguousarray(noise.swapaxes(-1, -2))
         lower = cholesky(transposed @ noise / (n - 1))
         pivots = np.diagonal(lower, axis1=-2, axis2=-1)
         if pivots.min(initial=1.0) >= _SAFE_PIVOT:
             return np.asarray(noise @ solve_upper(lower, transposed_root))
-    # With a small pivot the solution would lose digits; orthogonal steps do not.
+    # With a small pivot, or none, the solution would lose digits. Z = Q R loses none:
+    # √(N-1) Q has the identity as sample covariance too.
     q, r = np.linalg.qr(noise)
-    # A positive diagonal gives the basis that whitening does, whatever signs LAPACK prefers.
+    # LAPACK leaves the signs of Q open. With a positive diagonal of R it is Z C⁻ᵀ of the above.
     diagonal = np.diagonal(r, axis1=-2, axis2=-1)
     sign = np.where(diagonal < 0, -1.0, 1.0)[..., None, :]
     return np.asarray(np.sqrt(n - 1) * ((q * sign) @ transposed_root))

@@ -19,8 +19,12 @@ from .validation import Array, PositiveSemidefinite, validated
 __all__ = ["SolverError", "factor"]
 
 EPS = float(np.finfo(np.float64).eps)
-# Matrices up to this size are solved faster by substitution in numpy, if there are many.
+# Matrices up to this size are solved faster by substitution in numpy than by LAPACK if there are
+# many right-hand sides: more than so many for each row of one factor, or more than so many in all
+# systems together. The two take equally long at about these numbers.
 _SMALL = 12
+_MANY_PER_ROW = 200
+_MANY_IN_ALL = 600
 # Numbers in one block of small systems: half a megabyte stays in the cache.
 _BLOCK_SIZE = 2**16
 
@@ -65,7 +69,7 @@ def upper_triangle(dim: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def symmetrise(m: Array) -> Array:
-    """Average a square matrix and its transpose, where a product loses symmetry by rounding."""
+    """Average matrices (..., d, d) and their transposes, which differ by rounding only."""
     return np.asarray(0.5 * (m + m.swapaxes(-1, -2)))
 
 
@@ -87,10 +91,10 @@ def factor(cov: PositiveSemidefinite) -> Array:
     Notes
     -----
     :math:`\mathbf L\mathbf L^\top` meets `cov` to some 50 d units of rounding of
-    :math:`\sqrt{P_{ii}P_{jj}}`. A singular matrix has one such factor as long as each component
-    either is determined by those before it or is not: then draws with it do not depend on the
-    machine. Where a pivot is so small that rounding decides, elimination misses `cov`, and an
-    orthogonal reduction of the eigenvectors takes its place.
+    :math:`\sqrt{P_{ii}P_{jj}}`. If it is clear which components are linear combinations of those
+    before them, a singular matrix has one such factor, and draws with it do not depend on the
+    machine. Where rounding decides whether a pivot is zero, elimination can miss `cov`, and the
+    factor is computed from the eigenvectors by QR instead.
 
     Examples
     --------
@@ -106,7 +110,7 @@ def factor(cov: PositiveSemidefinite) -> Array:
 
 
 def cholesky(cov: Array) -> Array:
-    """Return the lower Cholesky factor; LinAlgError if a matrix is not positive definite."""
+    """Lower Cholesky factors (..., d, d); LinAlgError if a matrix is not positive definite."""
     d = cov.shape[-1]
     if cov.size == d * d > 0:
         # LAPACK itself takes a fifth of numpy's time for one matrix.
@@ -118,9 +122,10 @@ def cholesky(cov: Array) -> Array:
 
 
 def _semidefinite_cholesky(cov: Array) -> Array:
-    """Return the lower triangular factor with a zero column where a pivot vanishes."""
+    """Return lower triangular factors (..., d, d), with a zero column where a pivot vanishes."""
     d = cov.shape[-1]
-    scaled, unit = to_unit_variances(cov)
+    # With unit variances, rounding has the same size in every entry: a few d ε.
+    scaled, std = to_unit_variances(cov)
     lower = np.zeros_like(scaled)
     for j in range(d):
         # Column j of the Schur complement: A[j:, j] - L[j:, :j] L[j, :j]ᵀ
@@ -130,17 +135,19 @@ def _semidefinite_cholesky(cov: Array) -> Array:
         # A pivot of rounding counts as zero; division by infinity gives a zero column.
         root = np.sqrt(np.where(pivot > 16 * d * EPS, pivot, np.inf))
         lower[..., j:, j] = column / root[..., None]
+    # Elimination has failed if L Lᵀ misses the matrix by more than the pivots left out can do.
     error = np.abs(lower @ lower.swapaxes(-1, -2) - scaled)
-    worst = error.max(axis=(-2, -1), initial=0.0)
-    for index in np.argwhere(worst > 32 * d * EPS):
-        place = tuple(index)
-        lower[place] = _factor_from_eigenvectors(scaled[place])
-    return np.asarray(lower * unit[..., :, None])
+    largest_error = error.max(axis=(-2, -1), initial=0.0)
+    for index in np.argwhere(largest_error > 32 * d * EPS):
+        matrix = tuple(index)
+        lower[matrix] = _factor_from_eigenvectors(scaled[matrix])
+    return np.asarray(lower * std[..., :, None])
 
 
 def _factor_from_eigenvectors(cov: Array) -> Array:
-    """Return the lower triangular factor of one matrix by orthogonal steps, which lose nothing."""
+    """Return the lower triangular factor of one matrix (d, d), from its eigenvectors by QR."""
     values, vectors = np.linalg.eigh(cov)
+    # Eigenvalues have an error of about d ε times the largest; those below it count as zero.
     positive = values > 4 * len(cov) * EPS * values[-1]
     # P = A Aᵀ with the columns √λ v of A.
     columns = vectors[:, positive] * np.sqrt(values[positive])
@@ -150,10 +157,11 @@ def _factor_from_eigenvectors(cov: Array) -> Array:
 
 
 def lower_root(columns: Array) -> Array:
-    """Return the lower triangular L with L Lᵀ = A Aᵀ for A of these columns.
+    """Return the lower triangular L with L Lᵀ = A Aᵀ, for columns A (..., d, k).
 
-    By QR, which loses no definiteness. The diagonal is nonnegative, which leaves no signs to the
-    machine.
+    L has d rows, and as many columns as the smaller of d and k. QR does not form A Aᵀ, so that
+    rounding cannot make it indefinite. The sign of each column of L is arbitrary: the diagonal is
+    made nonnegative, so that the result is the same on every machine.
     """
     # Aᵀ = Q R, so A Aᵀ = Rᵀ R.
     upper: Array = np.asarray(np.linalg.qr(columns.mT, mode="r"))
@@ -177,8 +185,13 @@ def broadcast_leading(
 
 
 def solve_lower(lower: Array, right: Array, *, transposed: bool = False) -> Array:
-    r"""Solve L x = b, or Lᵀ x = b, (..., d, d) and (..., d, k); leading axes broadcast."""
+    """Solve L x = b, or Lᵀ x = b if `transposed`, for lower triangular L.
+
+    Shapes are (..., d, d) and (..., d, k), where leading axes broadcast; the result's is that of
+    the right-hand side.
+    """
     d, k = right.shape[-2:]
+    # One factor for all right-hand sides.
     if lower.size == d * d and lower.ndim <= right.ndim:
         return _solve_one_factor(lower.reshape(d, d), right, transposed)
     leading = lower.shape[:-2]
@@ -190,12 +203,13 @@ def solve_lower(lower: Array, right: Array, *, transposed: bool = False) -> Arra
     factors = lower.reshape(n, d, d)
     sides = right.reshape(n, d, k)
     if n > 2 * d:
-        # Row after row of all systems at once is faster than a call for each.
+        # Some numpy calls for each of d rows, of all systems at once, are fewer than one call of
+        # LAPACK for each of n systems.
         solution = _solve_in_blocks(factors, sides, transposed)
     else:
         solution = np.empty((n, d, k))
         for i in range(n):
-            if d <= _SMALL and k > 200 * d:
+            if d <= _SMALL and k > _MANY_PER_ROW * d:
                 solution[i] = _solve_one_factor(factors[i], sides[i], transposed)
             else:
                 solution[i], failed = dtrtrs(
@@ -207,7 +221,7 @@ def solve_lower(lower: Array, right: Array, *, transposed: bool = False) -> Arra
 
 
 def solve_upper(lower: Array, right: Array) -> Array:
-    r"""Solve Lᵀ x = b with the *lower* triangular factor."""
+    """Solve Lᵀ x = b, (..., d, k), with the *lower* triangular factor L (..., d, d)."""
     return solve_lower(lower, right, transposed=True)
 
 
@@ -220,14 +234,16 @@ def solve_definite(matrix: Array, right: Array) -> Array:
         if not failed:
             return np.asarray(solution.reshape(right.shape))
     elif _has_many_small_systems(matrix, right):
-        with suppress(np.linalg.LinAlgError):  # by rounding one may be indefinite
+        # P = L Lᵀ, so P⁻¹ b = L⁻ᵀ L⁻¹ b. A matrix that is indefinite by rounding has no factor.
+        with suppress(np.linalg.LinAlgError):
             lower = cholesky(matrix)
             return solve_upper(lower, solve_lower(lower, right))
+    # LU decomposition, which needs no definite matrix.
     return np.asarray(np.linalg.solve(matrix, right))
 
 
 def solve_semidefinite(matrix: Array, right: Array) -> Array:
-    """Solve P X = B for covariances of which some components may be known constants.
+    """Solve P X = B, (..., m, m) and (..., m, k), where components may be known constants.
 
     A component without variance has zero rows in P and in B, and gets zeros in X.
 
@@ -236,20 +252,20 @@ def solve_semidefinite(matrix: Array, right: Array) -> Array:
     """
     is_known = np.diagonal(matrix, axis1=-2, axis2=-1) == 0
     if np.count_nonzero(is_known):
-        # A one on the diagonal takes the component out of the sums.
+        # With a one on the diagonal its equation is x = 0.
         matrix = matrix + np.where(is_known[..., None], np.eye(matrix.shape[-1]), 0.0)
     return np.asarray(np.linalg.solve(matrix, right))
 
 
 def _has_many_small_systems(matrix: Array, right: Array) -> bool:
-    """Whether substitution in numpy is faster than a LAPACK call for each system."""
+    """Whether substitution in numpy is faster than a LAPACK call for each system (m, m)."""
     m = right.shape[-2]
     same_axes = matrix.shape[:-2] == right.shape[:-2]
-    return m <= _SMALL and right.size > 600 * m and same_axes
+    return m <= _SMALL and right.size > _MANY_IN_ALL * m and same_axes
 
 
 def _solve_one_factor(lower: Array, right: Array, transposed: bool) -> Array:
-    """Solve with one factor (d, d), of which all of `right` (..., d, k) are columns."""
+    """Solve with one factor (d, d) for right-hand sides (..., d, k), as columns of one matrix."""
     d, k = right.shape[-2:]
     if not right.size:
         return np.array(right)
@@ -258,7 +274,7 @@ def _solve_one_factor(lower: Array, right: Array, transposed: bool) -> Array:
         columns = right.reshape(d, k)
     else:
         columns = np.moveaxis(right, -2, 0).reshape(d, -1)
-    if d <= _SMALL and columns.size > 200 * d * d:
+    if d <= _SMALL and columns.shape[1] > _MANY_PER_ROW * d:
         # With so many columns LAPACK's copy to its own order costs more than the solution.
         x = np.array(columns[:, None], order="C")
         solution = _substitute(lower[..., None], x, transposed)
@@ -273,9 +289,10 @@ def _solve_one_factor(lower: Array, right: Array, transposed: bool) -> Array:
 
 
 def _solve_in_blocks(lower: Array, right: Array, transposed: bool) -> Array:
-    """Solve many small systems (n, d, d), as many at once as the cache holds."""
+    """Solve many small systems (n, d, d) and (n, d, k), as many at once as the cache holds."""
     solution = np.empty(right.shape)
-    block = max(1, _BLOCK_SIZE // (1 + lower[0].size + right[0].size))
+    numbers_each = 1 + lower[0].size + right[0].size
+    block = max(1, _BLOCK_SIZE // numbers_each)
     for start in range(0, len(solution), block):
         systems = slice(start, start + block)
         # Systems last, so that each row operation runs over contiguous memory.
@@ -286,7 +303,10 @@ def _solve_in_blocks(lower: Array, right: Array, transposed: bool) -> Array:
 
 
 def _substitute(lower: Array, x: Array, transposed: bool) -> Array:
-    """Solve in place, row after row of (d, k, n), with factors (d, d, n) or (d, d, 1)."""
+    """Solve n systems with factors (d, d, n), or one of all (d, d, 1), row after row.
+
+    The right-hand sides `x` (d, k, n) are overwritten by the solutions, which are also returned.
+    """
     d = len(x)
     if transposed:
         # Backward: x_i = b_i / L_ii, then b_j -= L_ij x_i for j < i.
@@ -302,12 +322,16 @@ def _substitute(lower: Array, x: Array, transposed: bool) -> Array:
 
 
 def whiten(lower: Array, vectors: Array) -> Array:
-    """Solve L z = v for vectors (..., d); leading axes broadcast."""
+    """Solve L z = v for vectors v (..., d) and factors L (..., d, d); leading axes broadcast.
+
+    If v has the covariance L Lᵀ, the components of z are independent with unit variance.
+    """
     if lower.ndim == 2:
-        # One factor for all vectors: they are its columns.
+        # One factor for all vectors: they are the columns of one right-hand side.
         n_vectors = math.prod(vectors.shape[:-1])
-        rows = vectors.reshape(n_vectors, len(lower) if not vectors.size else -1)
-        return _solve_one_factor(lower, rows.T, False).T.reshape(vectors.shape)
+        rows = vectors.reshape(n_vectors, vectors.shape[-1])
+        solution = _solve_one_factor(lower, rows.T, transposed=False)
+        return solution.T.reshape(vectors.shape)
     if lower.shape[-3] == 1 and vectors.ndim > 1:
         # One factor for all vectors along the last leading axis.
         columns = vectors.swapaxes(-1, -2)
@@ -318,12 +342,14 @@ def whiten(lower: Array, vectors: Array) -> Array:
 
 
 def quadratic_form(lower: Array, vector: Array) -> Array:
-    """Squared Mahalanobis length of vectors (..., d), by the covariance's Cholesky factor."""
+    """Squared Mahalanobis length vᵀ P⁻¹ v of vectors (..., d), by the Cholesky factor of P."""
+    # vᵀ P⁻¹ v = |L⁻¹ v|² for P = L Lᵀ
     return np.asarray((whiten(lower, vector) ** 2).sum(axis=-1))
 
 
 def log_det(lower: Array) -> Array:
-    """Logarithm of a covariance's determinant, by its Cholesky factor."""
+    """Logarithm of a covariance's determinant, (...), by its Cholesky factor L (..., d, d)."""
+    # log det L Lᵀ = 2 Σ log L_ii
     diagonal = np.diagonal(lower, axis1=-2, axis2=-1)
     return np.asarray(2.0 * np.log(diagonal).sum(axis=-1))
 
@@ -334,13 +360,15 @@ def log_sum_exp(logs: Array) -> Array:
     >>> log_sum_exp(np.zeros(2)).round(4)
     array([0.6931])
     """
-    # The bound keeps -inf - (-inf) out of the differences.
-    top = np.maximum(logs.max(axis=-1, keepdims=True), -1e300)
-    total = np.exp(logs - top).sum(axis=-1, keepdims=True)
+    # log Σ exp(l) = t + log Σ exp(l - t) with the largest l for t, so that nothing overflows. The
+    # bound keeps -inf - (-inf), which is NaN, out of the differences.
+    largest = np.maximum(logs.max(axis=-1, keepdims=True), -1e300)
+    total = np.exp(logs - largest).sum(axis=-1, keepdims=True)
     if np.count_nonzero(total) == total.size:
-        return np.asarray(top + np.log(total))
+        return np.asarray(largest + np.log(total))
+    # The logarithm of a sum of zero is -inf, which is no reason for a warning.
     with np.errstate(divide="ignore"):
-        return np.asarray(top + np.log(total))
+        return np.asarray(largest + np.log(total))
 
 
 def deviations(cov: Array) -> Array:
@@ -355,7 +383,11 @@ def deviations(cov: Array) -> Array:
 
 
 def to_unit_variances(cov: Array) -> tuple[Array, Array]:
-    """Scale covariances to unit variances; also return the standard deviations, 1 of a constant."""
+    """Return correlations P_ij / (s_i s_j) of covariances, (..., d, d), and the deviations s.
+
+    A constant, whose deviation is zero, is left as it is: its s (..., d) is 1.
+    """
+    # A variance may be negative by rounding.
     std = np.sqrt(np.abs(np.diagonal(cov, axis1=-2, axis2=-1)))
-    unit = np.where(std > 0, std, 1.0)
-    return cov / (unit[..., :, None] * unit[..., None, :]), unit
+    scale = np.where(std > 0, std, 1.0)
+    return cov / (scale[..., :, None] * scale[..., None, :]), scale

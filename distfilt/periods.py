@@ -56,7 +56,8 @@ else:
 
 # A function is linear up to wraps if it differs from its tangent by less, relative to its range.
 _LINEAR = 1e-5
-# How much a function may change when a circular component turns once, by rounding.
+# How much a function may change when a circular component turns once, relative to 1 + |f|: more
+# than the rounding of a turn in single precision, and far less than a missing period.
 _SAME = 1e-4
 
 
@@ -106,6 +107,7 @@ def read_periods(periods: object, dim: int, names: Sequence[str] = ()) -> Period
 
 
 def _read_period(period: object) -> float | None:
+    """Return one entry as a positive, finite float, or None where it is None."""
     if period is None:
         return None
     if isinstance(period, bool) or not isinstance(
@@ -118,8 +120,8 @@ def _read_period(period: object) -> float | None:
 
 
 @lru_cache(maxsize=64)
-def _circular(periods: Periods) -> tuple[NDArray[np.intp], Array]:
-    """Return the indices of the circular components, and their periods; both read-only."""
+def _find_circular(periods: Periods) -> tuple[NDArray[np.intp], Array]:
+    """Return the indices of the circular components and their periods, (c,) each, read-only."""
     circular = [k for k, period in enumerate(periods) if period is not None]
     places = np.array(circular, dtype=np.intp)
     p = np.array([periods[k] for k in circular], dtype=np.float64)
@@ -138,7 +140,7 @@ def align(values: Array, reference: Array, periods: Periods) -> Array:
     """
     if not periods:
         return values
-    places, p = _circular(periods)
+    places, p = _find_circular(periods)
     difference = values.take(places, axis=-1) - reference.take(places, axis=-1)
     # The usual case: all lie within half a period. NaN, a missing number, does not.
     if np.count_nonzero(np.abs(difference) < 0.5 * p) == difference.size:
@@ -173,7 +175,9 @@ def circular_mean(
     >>> circular_mean(np.array([[3.0], [-3.0]]), (2 * np.pi,)).round(4)
     array([[3.1416]])
     """
-    places, p = _circular(periods)
+    places, p = _find_circular(periods)
+    # Each member is a unit vector exp(2πi x/p) in the complex plane; the mean vector's direction
+    # is that of their sum.
     phases = np.exp(2j * np.pi / p * members[..., places])
     if weights is not None:
         phases = weights[..., None] * phases
@@ -201,9 +205,9 @@ def fold_torn(members: Array, periods: Periods) -> Array:
     folded = fold(members, periods)
     if folded is members:
         return members
-    places, p = _circular(periods)
+    places, p = _find_circular(periods)
     is_torn = 2 * folded.var(axis=-2) < members.var(axis=-2)
-    # Numbers with a cut lie within one period, but for the noise that was added since.
+    # Members that were wrapped lie within one period, a little more with noise added since.
     is_torn[..., places] &= np.ptp(members[..., places], axis=-2) < 1.25 * p
     return np.where(is_torn[..., None, :], folded, members)
 
@@ -216,8 +220,9 @@ def settle(members: Array, periods: Periods, weights: Array | None = None) -> Ar
         mean = members.mean(axis=-2, keepdims=True)
     else:
         mean = weights[..., None, :] @ members
+    # Wrapped as a difference from zero, the mean lies in the interval.
     shift = wrap_differences(mean, periods) - mean
-    # Exactly zero where nothing turns.
+    # The shift is exactly zero where the mean already lies in the interval.
     return members + shift if shift.any() else members
 
 
@@ -227,11 +232,13 @@ def gather(
     tangent: Callable[[], Array | None],
     fallback: Callable[[], Array],
 ) -> Array:
-    """Bring a function's values at N points (..., N, m) onto one branch.
+    """Bring a function's values at N points, such as the members of an ensemble, onto one branch.
 
-    Where the values lie within half a period, there is only one. Otherwise the branch continues
-    the tangent at the points' mean, if the function is linear up to wraps, as that of a compass
-    is. If not, each value is brought near that of `fallback`.
+    A branch is a choice of the multiple of the period that is added to each angle. Where the values
+    lie within half a period, one branch has them all close together: that of the first value.
+    Otherwise each value needs a reference of its own, to which it is brought near. That is the
+    tangent at the points' mean, if the function is linear but for wraps, as that of a compass is,
+    and `fallback` if not.
 
     Parameters
     ----------
@@ -239,24 +246,27 @@ def gather(
     bring_near : callable
         ``bring_near(values, reference)``, on the branch of the reference.
     tangent, fallback : callable
-        References (..., N, m) or (..., 1, m); a tangent may be None if there is none.
+        Functions without arguments, called only if they are needed, which is rare. They return the
+        references, (..., N, m) or (..., 1, m); a tangent may be None.
     """
     by_first = bring_near(values, values[..., :1, :])
     high = np.fmax.reduce(by_first, axis=-2, keepdims=True)
     low = np.fmin.reduce(by_first, axis=-2, keepdims=True)
-    # Within half a period the largest value is on the branch of the smallest.
+    # Within half a period the largest value is on the branch of the smallest already, and is not
+    # moved when it is brought near to it, up to rounding.
     rounding = 1e-9 * (1 + np.abs(high) + np.abs(low))
     is_wide = np.abs(bring_near(high, low) - high) > rounding
     if not is_wide.any():
         return by_first
-    wide = bring_near(values, fallback())
+    by_reference = bring_near(values, fallback())
     line = tangent()
     if line is not None:
         by_line = bring_near(values, line)
+        # The function is linear if its values lie on the tangent, up to wraps.
         error = np.abs(by_line - line).max(axis=-2, keepdims=True)
         is_linear = error <= _LINEAR * np.ptp(line, axis=-2, keepdims=True)
-        wide = np.where(is_linear, by_line, wide)
-    return np.where(is_wide, wide, by_first)
+        by_reference = np.where(is_linear, by_line, by_reference)
+    return np.where(is_wide, by_reference, by_first)
 
 
 def step_members(model: _Model, x: Array, t: float, dt: float) -> Array:
@@ -296,7 +306,7 @@ def step_members(model: _Model, x: Array, t: float, dt: float) -> Array:
         return np.asarray(moved + offsets @ slope.mT)
 
     def fallback() -> Array:
-        # Every member goes on from its place, by about the mean displacement.
+        # Every member moves by about the mean displacement, taken as a circular mean.
         return x + circular_mean(values - x, periods)
 
     return gather(values, bring_near, tangent, fallback)
@@ -307,7 +317,7 @@ def check_transition(model: _Model, x: Array, t: float, dt: float) -> None:
     if not needs_check(model, "periods"):
         return
     periods = cast(Periods, model.periods)
-    places, p = _circular(periods)
+    places, p = _find_circular(periods)
     before = model.step(x, t, dt)
     for place, period in zip(places, p, strict=True):
         turned = x.copy()
@@ -340,7 +350,7 @@ def check_sensor(
     x = states.mean(axis=-2)
     args = () if previous is None else (previous.mean(axis=-2),)
     before = sensor.predict(x, *args)
-    places, p = _circular(cast(Periods, model.periods))
+    places, p = _find_circular(cast(Periods, model.periods))
     for place, period in zip(places, p, strict=True):
         turned = x.copy()
         turned[..., place] += period
@@ -366,7 +376,8 @@ def warn_of_wrapping(
 
     `x` and `values` (..., N, d) are members before and after the forecast.
     """
-    # A cheap test first: of some members, those near each other come far apart.
+    # A cheap test first, on some sixteen members: those that were within a quarter of a turn are
+    # now more than half a turn apart.
     stride = max(1, values.shape[-2] // 16)
     some = values[..., ::stride, :]
     is_torn = some.max(axis=-2) - some.min(axis=-2) > np.pi
@@ -375,6 +386,8 @@ def warn_of_wrapping(
         is_torn &= some.max(axis=-2) - some.min(axis=-2) < 0.5 * np.pi
     if not is_torn.any() or not needs_check(model, "wrapping"):
         return
+    # Then all members, from the first: members that were within a quarter of a turn are now near a
+    # whole turn apart, or near zero turns, and some of them are one turn away.
     jumps = values - values[..., :1, :]
     is_narrow = np.ptp(x, axis=-2) < 0.5 * np.pi
     turns = np.round(jumps / (2 * np.pi))
@@ -384,7 +397,8 @@ def warn_of_wrapping(
     if not len(suspects):
         return
     *row, place = suspects[0].tolist()
-    # The proof: the function itself does not tell x from x + 2π.
+    # A jump proves nothing by itself. The function wraps the component if it moves x and x + 2π to
+    # the same state, up to rounding.
     turned = x.copy()
     turned[..., place] += 2 * np.pi
     change = np.abs(model.step(turned, t, dt) - model.step(x, t, dt))
@@ -416,11 +430,12 @@ def warn_of_wrapped_truth(f: Any, mean: Array, truth: Array) -> None:
     with np.errstate(invalid="ignore"):
         error = mean - truth
         jumps = np.diff(error, axis=0)
-        # A jump by a whole turn between two times, with small errors (mod 2π) at both.
+        # The error jumps by a whole turn, to a tenth of a radian or two, between two times.
         is_turn = np.abs(np.abs(jumps) - 2 * np.pi) < 0.2
+        # Errors of other causes look different. Here the error is within half a radian of a whole
+        # number of turns at nine times of ten, and at both times of the jump; and it is the truth
+        # or the estimate that leaps, by more than half a turn.
         remainder = np.abs(error - 2 * np.pi * np.round(error / (2 * np.pi)))
-        # Errors of another kind are not near whole turns nearly always, and at both times of
-        # the jump; nor is the truth or the estimate a whole turn away from one time to the next.
         is_near = remainder < 0.5
         is_close = is_near[:-1] & is_near[1:] & (is_near.mean(axis=0) >= 0.9)
         steps = [np.abs(np.diff(values, axis=0)) for values in (mean, truth)]

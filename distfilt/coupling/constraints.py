@@ -31,12 +31,14 @@ from ..validation import (
 __all__ = ["Constraint", "norm_constraint", "project", "retract"]
 
 Variant = Literal["printed", "reversed", "particle", "shift"]
-"""Four variants of (12): the gain times D_i - d̂, d̂ - D_i, d - D_i, or d - d̂."""
+"""Variants of (12) of Das and Bhattacharya: the gain times D_i - d̂, d̂ - D_i, d - D_i or d - d̂."""
 Motion = tuple[DistinctIndices, DistinctIndices]
 """Indices of positions and of their velocities, in the same order."""
 
 _TOLERANCE = 1e-15
-"""Largest relative residual after :func:`retract`."""
+"""Relative residual that :func:`retract` aims at: a few units of rounding."""
+_TOLERABLE = 1e3 * _TOLERANCE
+"""Relative residual that it accepts where no step along the normals makes it smaller."""
 _STEPS = 50
 """Largest number of Newton steps in :func:`retract`."""
 _HALVINGS = 30
@@ -76,7 +78,7 @@ class Constraint(FrozenModel):
         return check_array(self.violation(x), "function")
 
     def violation(self, x: Array) -> Array:
-        """Return the residual without checks, for trial steps: NaN where g has no value."""
+        """Return the residual (..., s) of any states (..., d): NaN where g has no value."""
         shape = (*x.shape[:-1], self.value.size)
         try:
             g = call_user(self.function, x.copy())
@@ -139,7 +141,7 @@ def project(
     regularisation: NonNegativeFloat = 1e-6,
     safeguard: bool = True,
 ) -> Array:
-    r"""Regress the members on the constraint and correct them, equations (6)-(12).
+    r"""Regress the members on the constraint and correct them: (6)-(12) of Das and Bhattacharya.
 
     With :math:`\mathbf D_i=\mathbf g(\mathbf x_i)`, their mean :math:`\hat{\mathbf d}` and the gain
     :math:`\mathbf K=\boldsymbol\Sigma_{xd}(\boldsymbol\Sigma_{dd}+\epsilon\mathbf I)^{-1}`:
@@ -205,7 +207,8 @@ def project(
         return np.asarray(projected)
     before = residual
     after = constraint.violation(projected)
-    # The members' own residuals may grow where only their mean is moved: g is curved.
+    # If only the mean is to be moved, only its residual is judged: where g is curved, the members'
+    # own may grow.
     if variant == "shift":
         before = mean_residual
         after = after.mean(axis=-2, keepdims=True)
@@ -263,20 +266,22 @@ def retract(
     """
     x = states.reshape(-1, states.shape[-1]).copy()
     residual = constraint.residual(x)
+    # Indices of the states that have not converged: only they take part.
     active = np.arange(len(x))
-    # Only states that have not converged take part.
     for _ in range(_STEPS):
         slope, error = _relative_residual(constraint, x[active], residual[active])
-        unsolved = error > _TOLERANCE
-        active = active[unsolved]
+        is_unsolved = error > _TOLERANCE
+        active = active[is_unsolved]
         if not active.size:
             break
-        step = _normal_step(slope[unsolved], residual[active])
-        x[active], residual[active], decreased = _line_search(
+        step = _normal_step(slope[is_unsolved], residual[active])
+        x[active], residual[active], has_decreased = _line_search(
             constraint, x[active], residual[active], step
         )
-        # Rounding ends the descent a little above the tolerance where g is large.
-        active = active[decreased | (error[unsolved] > 1e3 * _TOLERANCE)]
+        # Where g is large its rounding ends the descent above the tolerance, but not far above: a
+        # state whose residual is tolerable and decreases no more has arrived.
+        is_tolerable = error[is_unsolved] <= _TOLERABLE
+        active = active[has_decreased | ~is_tolerable]
     else:
         error = _relative_residual(constraint, x[active], residual[active])[1]
         active = active[error > _TOLERANCE]
@@ -293,9 +298,12 @@ def retract(
 def _relative_residual(
     constraint: Constraint, x: Array, residual: Array
 ) -> tuple[Array, Array]:
-    """Return Jacobians at states (n, d), and residuals in units of the values' magnitude."""
+    """Return Jacobians (n, s, d) at states x (n, d), and each state's largest relative residual.
+
+    The residuals (n, s) are taken relative to the magnitude of g_i, of which rounding is a part ε.
+    """
     slope = constraint.jacobian(x)
-    # Rounding of x alone changes g_i by up to eps |grad g_i| |x|.
+    # Rounding of x alone changes g_i by up to ε |∇g_i| |x|.
     state_unit = np.linalg.norm(slope, axis=-1) * np.linalg.norm(x, axis=-1)[:, None]
     unit = np.maximum(np.abs(constraint.value), state_unit)
     # A residual of zero is exact, even where its unit is zero too.
@@ -304,17 +312,21 @@ def _relative_residual(
 
 
 def _normal_step(slope: Array, residual: Array) -> Array:
-    """Return the shortest step that removes `residual` to first order, -J'(J J')⁻¹(g - d)."""
-    # The rank does not depend on the units of the constraints: normals have length one.
+    """Return the shortest step that removes `residual` to first order, -J'(J J')⁻¹(g - d).
+
+    Jacobians are (n, s, d), residuals (n, s), steps (n, d).
+    """
+    # Normals of length one, so that the rank does not depend on the units of the constraints. A
+    # zero normal becomes NaN, then zero, and its eigenvalue is zero.
     with np.errstate(invalid="ignore"):
         normals = slope / np.linalg.norm(slope, axis=-1, keepdims=True)
     correlations = np.nan_to_num(normals @ normals.mT)
-    least = np.linalg.eigvalsh(correlations)[..., 0]
-    deficient = ~(least > _LEAST_EIGENVALUE)
-    if deficient.any():
+    smallest_eigenvalue = np.linalg.eigvalsh(correlations)[..., 0]
+    is_deficient = ~(smallest_eigenvalue > _LEAST_EIGENVALUE)
+    if is_deficient.any():
         raise ValueError(
             "constraint must have a Jacobian of full rank, got one that loses rank at "
-            f"state {deficient.argmax()} ({deficient.sum()} of {deficient.size})"
+            f"state {is_deficient.argmax()} ({is_deficient.sum()} of {is_deficient.size})"
         )
     multipliers = np.linalg.solve(slope @ slope.mT, residual[..., None])
     return np.asarray(-(slope.mT @ multipliers)[..., 0])
@@ -325,29 +337,30 @@ def _line_search(
 ) -> tuple[Array, Array, Mask]:
     """Halve each state's step until its residual decreases.
 
-    Returns the states, their residuals, and whether these have decreased.
+    States and steps are (n, d), residuals (n, s). Returns the new states, their residuals, and
+    whether these have decreased (n,); a state whose residual does not stays where it is.
     """
-    # Every state has its own step length, a power of one half.
     before = np.linalg.norm(residual, axis=-1)
-    decreased = np.zeros(len(x), dtype=bool)
+    has_decreased = np.zeros(len(x), dtype=bool)
     new_x = x.copy()
     new_residual = residual.copy()
     for k in range(_HALVINGS):
-        rows = np.flatnonzero(~decreased)
+        # The states that are still to be moved try 1, 1/2, 1/4, ... of their steps.
+        rows = np.flatnonzero(~has_decreased)
         trial = x[rows] + 0.5**k * step[rows]
         trial_residual = constraint.violation(trial)
         # False too where g has no value, NaN.
-        accepted = np.linalg.norm(trial_residual, axis=-1) < before[rows]
-        new_x[rows[accepted]] = trial[accepted]
-        new_residual[rows[accepted]] = trial_residual[accepted]
-        decreased[rows[accepted]] = True
-        if decreased.all():
+        is_smaller = np.linalg.norm(trial_residual, axis=-1) < before[rows]
+        new_x[rows[is_smaller]] = trial[is_smaller]
+        new_residual[rows[is_smaller]] = trial_residual[is_smaller]
+        has_decreased[rows[is_smaller]] = True
+        if has_decreased.all():
             break
-    return new_x, new_residual, decreased
+    return new_x, new_residual, has_decreased
 
 
 def _make_tangent(x: Array, constraint: Constraint, motion: Motion) -> None:
-    """Remove the part of the velocities along the normals, in place, for states (n, d)."""
+    """Remove the part of the velocities along the normals, in the array of states (n, d) itself."""
     positions = list(motion[0])
     velocities = list(motion[1])
     _check_motion(motion, x.shape[-1])

@@ -42,6 +42,9 @@ _NEWTON = 1000
 """Largest number of Newton steps; twenty are enough as a rule."""
 _OPTIMAL = 1e-9
 """A plan is solved again if its duality gap is a larger part of its cost."""
+_RESOLVED = 1e6
+"""Costs are cut at so many times the mean cost of a plan: beside larger ones the network simplex,
+whose tolerances are relative to the largest, does not resolve the others."""
 _FORBIDDEN = 1e4
 """Costs that exceed all others by this factor are those of forbidden links."""
 
@@ -182,7 +185,7 @@ def transport_plan(
     if solver == "entropic":
         matrix, potential = _solve_allowed(cost, a, b, solve)
         return _certify(cost, a, b, matrix, potential)
-    matrix, potential = _solve_massive(cost, a, b, solve)
+    matrix, potential = _solve_on_support(cost, a, b, solve)
     plan = _certify(cost, a, b, matrix, potential)
     return _improve(plan, cost, a, b, solve)
 
@@ -190,7 +193,7 @@ def transport_plan(
 def _normalize_masses(
     rows: Array, columns: Array | None, n_columns: int
 ) -> tuple[Array, Array]:
-    """Return masses that sum to one; those of the columns are equal by default."""
+    """Return masses (N,) and (M,) that sum to one; those of the columns are equal by default."""
     if columns is None:
         column_masses = np.full(n_columns, 1 / n_columns)
     else:
@@ -199,7 +202,7 @@ def _normalize_masses(
 
 
 def scale_cost(cost: Array, limit: float | None = None) -> tuple[Array, float, float]:
-    """Return the cost between zero and one, its minimum and its range.
+    """Return the cost (N, M) scaled to lie between zero and one, its minimum and its range.
 
     With a limit the range is up to there, and larger costs remain larger than one.
     """
@@ -211,25 +214,26 @@ def scale_cost(cost: Array, limit: float | None = None) -> tuple[Array, float, f
     return (cost - minimum) / divisor, minimum, scale
 
 
-def _massive_cost(cost: Array, a: Array, b: Array) -> Array:
-    """Return the costs between rows and columns that have mass."""
+def _cost_on_support(cost: Array, a: Array, b: Array) -> Array:
+    """Return the costs between the rows and columns whose masses a (N,), b (M,) are positive."""
     return np.asarray(cost[np.ix_(np.flatnonzero(a), np.flatnonzero(b))])
 
 
-def _solve_massive(
+def _solve_on_support(
     cost: Array, a: Array, b: Array, solve: Solve, limit: float | None = None
 ) -> tuple[Array, Array]:
     """Solve for rows and columns with mass, for costs in units of their range up to a limit.
 
-    Returns the plan and the columns' potentials, zero for those without mass.
+    Returns the plan (N, M), and the columns' potentials (M,) in the units of the cost, zero for
+    those without mass.
     """
     rows = np.flatnonzero(a)
     columns = np.flatnonzero(b)
-    massive = _massive_cost(cost, a, b)
-    scaled_cost, minimum, scale = scale_cost(massive, limit)
+    scaled_cost, minimum, scale = scale_cost(_cost_on_support(cost, a, b), limit)
     part, g = solve(scaled_cost, a[rows], b[columns])
     matrix = np.zeros(cost.shape)
     matrix[np.ix_(rows, columns)] = part
+    # The potentials of c = minimum + scale c' are scale f and minimum + scale g.
     potential = np.zeros(cost.shape[1])
     potential[columns] = minimum + scale * g
     return matrix, potential
@@ -238,23 +242,26 @@ def _solve_massive(
 def _solve_allowed(
     cost: Array, a: Array, b: Array, solve: Solve
 ) -> tuple[Array, Array]:
-    """Solve the entropic problem with the range of the links that are not forbidden."""
-    massive = _massive_cost(cost, a, b)
-    limit = _largest_allowed(massive)
+    """Solve the entropic problem with the range of the links that are not forbidden.
+
+    Returns the plan and the columns' potentials, as :func:`_solve_on_support` does.
+    """
+    limit = _largest_allowed(_cost_on_support(cost, a, b))
     if limit is not None:
         try:
-            matrix, potential = _solve_massive(cost, a, b, solve, limit)
+            matrix, potential = _solve_on_support(cost, a, b, solve, limit)
         except SolverError:
+            # There is no plan without the forbidden links.
             limit = None
         else:
             if not matrix[cost > limit].any():
                 return matrix, potential
     # All links count if there are no forbidden ones, or if the plan cannot do without.
-    return _solve_massive(cost, a, b, solve)
+    return _solve_on_support(cost, a, b, solve)
 
 
 def _largest_allowed(cost: Array) -> float | None:
-    """Return the largest cost below a wide gap that forbidden links leave, if there is one.
+    """Return the largest of costs (N, M) below a wide gap that forbidden links leave, if any.
 
     >>> _largest_allowed(np.array([[0.0, 1.0], [3.0, 1e9]]))
     3.0
@@ -267,12 +274,14 @@ def _largest_allowed(cost: Array) -> float | None:
     >>> _largest_allowed(squared_distances([[0.0], [1e-9], [1.0], [2.0]]))
     """
     shifted = cost - cost.min()
-    # Every row and every column needs its cheapest link at least.
-    needed = max(shifted.min(axis=1).max(), shifted.min(axis=0).max())
-    values = np.sort(shifted[(shifted > 0) & (shifted >= needed)])
+    # A limit below the cheapest link of some row or column would leave its mass no way.
+    dearest_minimum = max(shifted.min(axis=1).max(), shifted.min(axis=0).max())
+    values = np.sort(shifted[(shifted > 0) & (shifted >= dearest_minimum)])
+    # Costs after which the next one is ten thousand times as large.
     gaps = np.flatnonzero(values[1:] > _FORBIDDEN * values[:-1])
+    n_links = sum(cost.shape) - 1
     for limit in values[gaps].tolist():
-        if np.count_nonzero(shifted <= limit) >= sum(cost.shape) - 1:
+        if np.count_nonzero(shifted <= limit) >= n_links:
             return float(limit + cost.min())
     return None
 
@@ -282,18 +291,21 @@ def _improve(
 ) -> TransportPlan:
     """Solve again with costs cut at a limit while the duality gap is too wide.
 
-    Beside a very large cost the others vanish in the solver's rounding. A plan for cut costs that
-    uses no link above the limit is a plan for all.
+    The plan is that of `solve` for costs (N, M) and masses a (N,) and b (M,); returned is the best
+    one found. Beside a very large cost the others vanish in the solver's rounding. An optimal plan
+    for the cut costs that uses no link above the limit is optimal for the costs themselves.
     """
-    massive = _massive_cost(cost, a, b)
-    minimum = float(massive.min())
-    limit = minimum + 1e6 * (plan.value - minimum)
+    supported = _cost_on_support(cost, a, b)
+    minimum = float(supported.min())
+    limit = minimum + _RESOLVED * (plan.value - minimum)
+    # Each round either makes the plan better or the limit a thousand times larger: few are needed.
     for _ in range(20):
         excess = plan.value - minimum
         is_optimal = plan.duality_gap <= _OPTIMAL * excess
-        if is_optimal or limit >= massive.max():
+        if is_optimal or limit >= supported.max():
             break
-        matrix, potential = _solve_massive(np.minimum(cost, limit), a, b, solve)
+        cut_cost = np.minimum(cost, limit)
+        matrix, potential = _solve_on_support(cut_cost, a, b, solve)
         if matrix[cost > limit].any():
             # The plan needs dearer links.
             limit = minimum + 1e3 * (limit - minimum)
@@ -302,15 +314,18 @@ def _improve(
         if not trial.duality_gap < plan.duality_gap:
             break
         plan = trial
-        limit = minimum + 1e6 * (plan.value - minimum)
+        limit = minimum + _RESOLVED * (plan.value - minimum)
     _check_gap(plan, minimum, a, b)
     return plan
 
 
 def _check_gap(plan: TransportPlan, minimum: float, a: Array, b: Array) -> None:
-    """Raise an error if the duality gap is more than rounding can make it."""
+    """Raise an error if the duality gap is above a millionth of the cost, and above rounding.
+
+    The cost counts from its minimum, since a constant that is added to it changes nothing.
+    """
     f, g = plan.potentials
-    # Rounding of the two sums of the bound, and of the cost.
+    # Rounding of the two sums of the bound, and of the cost, is proportional to their terms.
     sizes = np.abs(f) @ a + np.abs(g) @ b + abs(plan.value)
     allowed = 1e-6 * (plan.value - minimum) + 1e-12 * float(sizes)
     if not plan.duality_gap <= allowed:
@@ -321,7 +336,11 @@ def _check_gap(plan: TransportPlan, minimum: float, a: Array, b: Array) -> None:
 
 
 def _certify(cost: Array, a: Array, b: Array, matrix: Array, g: Array) -> TransportPlan:
-    """Return the plan with potentials that are feasible whatever the solver's were."""
+    """Return the plan with potentials that are feasible whatever the solver's were.
+
+    Given the plan `matrix` (N, M) and the columns' potentials `g` (M,), the largest feasible f and
+    then the largest feasible g are taken: the best bound that can be had from them.
+    """
     # A solver leaves out columns without mass; their potentials have no meaning.
     g = np.where(b > 0, g, -np.inf)
     # f_i = min_j (c_ij - g_j), then g_j = min_i (c_ij - f_i): f_i + g_j <= c_ij.
@@ -337,20 +356,23 @@ Solve = Callable[[Array, Array, Array], tuple[Array, Array]]
 
 
 def solver_of(name: Solver, regularisation: float = 0.01) -> Solve:
-    """Return the solver of a name, for a cost between zero and one."""
+    """Return the solver of a name, with its option, for a cost between zero and one."""
     if name == "entropic":
         return partial(_solve_entropic, strength=regularisation)
     return _solve_network
 
 
 def _solve_network(cost: Array, a: Array, b: Array) -> tuple[Array, Array]:
-    """Solve by POT's network simplex, called directly.
+    """Solve by POT's network simplex; return the plan (N, M) and the columns' potentials (M,).
 
-    `ot.emd` around it would take 0.2 ms more, half as much as the solution at N = 50.
+    It is called directly: `ot.emd` around it would take 0.2 ms more, half as much as the solution
+    at N = 50.
     """
     emd = import_optional("ot.lp.emd_wrap", "maps")
-    # plan, cost, row potentials, column potentials, status.
+    # Returns plan, cost, row potentials, column potentials, status; the last argument is its
+    # number of threads.
     matrix, _, _, g, status = emd.emd_c(a, b, np.ascontiguousarray(cost), _PIVOTS, 1)
+    # In POT's solver 1 means optimal.
     if status != 1:
         raise SolverError(f"network simplex: stopped with status {status}")
     return np.asarray(matrix), np.asarray(g)
@@ -362,19 +384,21 @@ def _solve_entropic(
     """Solve by Newton's method, with an entropy whose weight is halved down to `strength`.
 
     Sinkhorn's iteration is slow on the plateaus of a dual with little entropy. Masses of zero are
-    left out.
+    left out. Returns the plan (N, M) and the columns' potentials (M,).
     """
     rows = np.flatnonzero(a)
     columns = np.flatnonzero(b)
-    massive_cost = cost[np.ix_(rows, columns)]
+    supported = cost[np.ix_(rows, columns)]
     g = np.zeros(len(columns))
+    # The first weight is a tenth of the cost's range or more, which makes the dual smooth.
     halvings = max(0, math.ceil(math.log2(0.1 / strength)))
     for k in range(halvings, -1, -1):
-        # The potentials of a larger weight are the start for the next, so need few digits.
+        # Only the last weight counts; the potentials of a larger one are a start for the next, for
+        # which few digits are enough.
         weight = strength * 2.0**k
         tolerance = 1e-3 if k else 1e-10
         matrix, g, error = _solve_unit_entropy(
-            massive_cost / weight, a[rows], b[columns], g / weight, tolerance
+            supported / weight, a[rows], b[columns], g / weight, tolerance
         )
         g = weight * g
     # Written so that NaN is an error too.
@@ -395,11 +419,16 @@ def _solve_entropic(
 
 
 def _correct_in_proportion(matrix: Array, a: Array, b: Array) -> Array:
-    """Give a matrix its marginals by factors 1 + u_i + v_j, which keep empty links empty."""
+    """Give a matrix its marginals by factors 1 + u_i + v_j, which keep empty links empty.
+
+    The matrix (N, M) has sums of rows and columns near the masses a and b. They are linear in u and
+    v, so that one round would do, but for rounding and for negative factors, which are cut at zero.
+    """
     for _ in range(3):
         row_sums = matrix.sum(axis=1)
         column_sums = matrix.sum(axis=0)
-        # diag(T1) u + T v = a - T1 and T'u + diag(T'1) v = b - T'1, singular along constants.
+        # diag(T1) u + T v = a - T1 and T'u + diag(T'1) v = b - T'1. Adding a constant to u and
+        # taking it off v changes nothing: the system is singular, and the least solution is taken.
         system = np.block(
             [[np.diag(row_sums), matrix], [matrix.T, np.diag(column_sums)]]
         )
@@ -413,14 +442,19 @@ def _correct_in_proportion(matrix: Array, a: Array, b: Array) -> Array:
 def _plan_of_potential(
     g: Array, cost: Array, rows: Array, columns: Array
 ) -> tuple[Array, float]:
-    """Return the plan of a column potential, with exact row sums, and the negative dual value."""
+    """Return the plan of a column potential, with exact row sums, and the negative dual value.
+
+    The potential g is (M,), the cost (N, M), with an entropy of unit weight; `rows` are the masses
+    a (N,), `columns` the masses b (M,).
+    """
     from scipy.special import logsumexp
 
     # t_ij = a_i exp(g_j - c_ij) / sum_j exp(g_j - c_ij).
     exponents = g - cost
-    total = logsumexp(exponents, axis=1)
-    matrix = rows[:, None] * np.exp(exponents - total[:, None])
-    return matrix, float(rows @ total - columns @ g)
+    log_sums = logsumexp(exponents, axis=1)
+    matrix = rows[:, None] * np.exp(exponents - log_sums[:, None])
+    # sum_i a_i log sum_j exp(g_j - c_ij) - sum_j b_j g_j.
+    return matrix, float(rows @ log_sums - columns @ g)
 
 
 def _solve_unit_entropy(
@@ -428,8 +462,10 @@ def _solve_unit_entropy(
 ) -> tuple[Array, Array, float]:
     """Minimise the negative dual with unit entropy by damped Newton steps from g.
 
-    Returns the plan, the column potential, and the error of the column sums. The step is damped
-    as by Levenberg and Marquardt.
+    Arguments are as of :func:`_plan_of_potential`. Returns the plan (N, M), the column potential
+    (M,), and the error of the column sums, that of all columns together, to which `tolerance`
+    applies. The step is damped as by Levenberg and Marquardt: ten times less after a success, ten
+    times more after a failure.
     """
     damping = 1e-2
     matrix, value = _plan_of_potential(g, cost, rows, columns)
@@ -437,6 +473,7 @@ def _solve_unit_entropy(
         sums = matrix.sum(axis=0)
         # The gradient is sums - columns.
         error = float(np.abs(sums - columns).sum())
+        # With more damping than 1e9 the steps vanish: nothing is left to gain.
         if error < tolerance or damping > 1e9:
             break
         # Hessian diag(T'1) - T' diag(a)⁻¹ T, damped in units of the masses.
@@ -450,7 +487,8 @@ def _solve_unit_entropy(
             trial_error = np.abs(trial_matrix.sum(axis=0) - columns).sum()
             accepted = bool(trial_error < 0.5 * error)
         if accepted:
-            # The dual does not change with a constant added to g.
+            # The dual does not change with a constant added to g. Without any damping the Hessian
+            # would be singular in that direction.
             g = trial - trial.mean()
             matrix = trial_matrix
             value = trial_value
@@ -461,7 +499,11 @@ def _solve_unit_entropy(
 
 
 def _correct_marginals(matrix: Array, a: Array, b: Array) -> Array:
-    """Give a matrix exact marginals, in place: scale down excesses, then spread the deficits."""
+    """Return the matrix (N, M) with exact marginals a and b; the argument is overwritten.
+
+    Rows and columns with too much mass are scaled down, then the mass that is missing is spread
+    over those with too little: the rounding of J. Altschuler, J. Weed, P. Rigollet (2017).
+    """
     for masses, axis in ((a, 1), (b, 0)):
         total = matrix.sum(axis=axis)
         excess = total > masses
@@ -469,7 +511,7 @@ def _correct_marginals(matrix: Array, a: Array, b: Array) -> Array:
         matrix *= np.expand_dims(factor, axis)
     row_deficit = np.maximum(a - matrix.sum(axis=1), 0.0)
     column_deficit = np.maximum(b - matrix.sum(axis=0), 0.0)
-    # Both sum to the same, but for rounding; never divide by zero.
+    # Both sum to the same, but for rounding. If nothing is missing, both are zero.
     total_deficit = max(column_deficit.sum(), row_deficit.sum(), np.finfo(float).tiny)
     return np.asarray(matrix + np.outer(row_deficit, column_deficit) / total_deficit)
 
@@ -511,7 +553,9 @@ def monotone_plan(
     j = column_order[column_ranks]
     matrix = np.zeros((source.size, target.size))
     np.add.at(matrix, (i, j), mass)
-    # Along the staircase f + g = c holds on every cell: a step sideways changes g only.
+    # Potentials with f_i + g_j = c_ij on every cell of the staircase. A step to the next column in
+    # the same row leaves f_i, so that g changes by the difference of the two costs. A step down
+    # leaves g_j. The staircase never moves both ways at once.
     cost = (source[:, None] - target) ** 2
     cell_cost = cost[i, j]
     previous_column_cost = cost[i[1:], j[:-1]]
@@ -523,9 +567,10 @@ def monotone_plan(
 
 
 def _staircase(a: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Return the cells and masses of the coupling in sorted order, at most N + M - 1 of them.
+    """Return the coupling of masses a (N,) and b (M,) that keeps their order.
 
-    Cells are given by their rows and by their columns.
+    It has N + M - 1 cells, which go down and right like a staircase: their rows, their columns and
+    their masses, of which some may be zero.
     """
     # The unit interval is cut at both cumulative sums; each interval is a cell.
     cuts = np.concatenate([np.cumsum(a)[:-1], np.cumsum(b)[:-1]])

@@ -84,15 +84,16 @@ def normalize_weights(
     # Logarithms of weights, or of likelihoods, are negative as a rule.
     if logs.size and logs.max() > 0:
         _warn_of_likelihoods(logs)
-    # The largest weight is one, so that none overflows.
+    # Divided by the largest weight, so that none overflows.
     weights = np.exp(logs - largest)
     return np.asarray(weights / weights.sum(axis=-1, keepdims=True))
 
 
 def _warn_of_likelihoods(logs: Array) -> None:
-    """Warn if log-weights look like weights or likelihoods: not negative, and small beside one.
+    """Warn if log-weights (..., N) look like weights or likelihoods whose logarithm is missing.
 
-    Logarithms of high densities are positive too, but then most are near the largest one.
+    Those are not negative, and either all at most 1, or mostly small beside the largest. Logarithms
+    of high densities are positive too, but most of them are near the largest one.
 
     >>> with warnings.catch_warnings(action="error"):
     ...     _warn_of_likelihoods(np.array([21.0, 17.5, 20.3, 19.9]))
@@ -103,7 +104,7 @@ def _warn_of_likelihoods(logs: Array) -> None:
     rows = logs.reshape(-1, logs.shape[-1])
     least = rows.min(axis=-1)
     largest = rows.max(axis=-1)
-    # Equal numbers are the same weights either way.
+    # Equal numbers mean equal weights, whether they are logarithms or not.
     is_suspect = (least >= 0) & (largest > least)
     if not is_suspect.any():
         return
@@ -121,7 +122,7 @@ def _warn_of_likelihoods(logs: Array) -> None:
 
 @lru_cache(maxsize=8)
 def _tie_breaker(n: int) -> Array:
-    """Return a fixed matrix between 0 and 1e-7, an addition to costs of range one.
+    """Return a fixed matrix (n, n) between 0 and 1e-7, an addition to costs of range one.
 
     Where members coincide, as copies do after one weight has dominated, the cheapest coupling is
     not unique, and the last bit of a cost would choose between quite different ensembles. With the
@@ -169,12 +170,13 @@ def transport_plans(
 def _solve_plans(
     ensemble: Array, weights: Array, solve: Solve, cost: Cost = "squared"
 ) -> Array:
-    """Return couplings (..., N, N) of the weights to equal masses, for a distance."""
+    """Return couplings (..., N, N) of weights (..., N) to equal masses, for members (..., N, d)."""
     n = weights.shape[-1]
     flat_ensemble = ensemble.reshape(-1, *ensemble.shape[-2:])
     squares = np.array([squared_distances(members) for members in flat_ensemble])
     costs = squares.reshape(*weights.shape, n)
     if cost == "distance":
+        # Distances are copies' up to the root of that part of the squared ones.
         return _solve_couplings(np.sqrt(costs), weights, solve, _ROUNDING**0.5)
     return _solve_couplings(costs, weights, solve)
 
@@ -202,7 +204,9 @@ def _solve_couplings(
 
 
 def _has_far_members(scaled_cost: Array, rounding: float = _ROUNDING) -> bool:
-    """Whether a few large costs set the range, so that most are small beside it.
+    """Whether a few large costs set the range, so that over a quarter is small beside it.
+
+    The costs (N, N) are between zero and one; those up to `rounding` are of copies and count not.
 
     >>> x = np.array([[0.0], [1.0], [2.0], [3.0], [1e4]])
     >>> for members in (x, x[:4]):
@@ -211,7 +215,8 @@ def _has_far_members(scaled_cost: Array, rounding: float = _ROUNDING) -> bool:
     False
     """
     is_small = scaled_cost < _FAR
-    # Mostly even copies and near members together are few.
+    # A quick test for the usual case: of all costs, copies included, at most a fifth is small.
+    # Without the copies, which are small, the part of small ones is less still.
     if 5 * np.count_nonzero(is_small) <= is_small.size:
         return False
     # Copies of a member are at no distance, but for rounding.
@@ -223,22 +228,24 @@ def _has_far_members(scaled_cost: Array, rounding: float = _ROUNDING) -> bool:
 def _couple_far_members(
     costs: Array, weights: Array, solve: Solve, rounding: float
 ) -> Array:
-    """Return the coupling of the weights to equal masses where some members are far away.
+    """Return the coupling (N, N) of weights to equal masses where some members are far away.
 
-    Ties are broken by a part of the typical cost, which is not above the distances of near
-    members.
+    Ties are broken by a part of the typical cost, the lower quartile, which is not above the
+    distances of near members.
     """
     n = weights.size
     equal = np.full(n, 1 / n)
     rows = np.flatnonzero(weights > _NO_MASS)
-    # A constant in a column does not change the plan: far members differ in the rest only.
-    needed = costs[rows] - costs[rows].min(axis=0)
+    # A constant that is taken off a column does not change the plan. Without it the cost of a far
+    # place is only what it costs more to go there from one member than from another.
+    excess_costs = costs[rows] - costs[rows].min(axis=0)
     is_apart = costs > rounding * costs.max()
     typical = float(np.quantile(costs[is_apart], 0.25))
-    needed = needed + _tie_breaker(n)[rows] * typical
+    excess_costs = excess_costs + _tie_breaker(n)[rows] * typical
     mass = weights[rows].sum()
-    part = _solve_in_stages(needed, weights[rows] / mass, equal, typical, solve)
-    # Members of hardly any weight go everywhere alike, so that the masses stay exact.
+    part = _solve_in_stages(excess_costs, weights[rows] / mass, equal, typical, solve)
+    # The mass of members with almost no weight is spread evenly over all places. The masses of rows
+    # and columns stay exact, and the solver meets no tiny numbers.
     plan = np.outer(weights, equal)
     plan[rows] = mass * part
     return plan
@@ -247,10 +254,12 @@ def _couple_far_members(
 def _solve_in_stages(
     cost: Array, a: Array, b: Array, typical: float, solve: Solve
 ) -> Array:
-    """Solve for costs that differ by many powers of ten, the large differences first.
+    """Return the plan for costs that differ by many powers of ten, the large differences first.
 
-    The potentials of one stage are taken off the cost, which does not change the plan. What is
-    left is small where the plan has mass, and is cut above a limit for the next stage.
+    Costs are (N, M), masses a (N,) and b (M,), and `typical` is a typical cost. The potentials of
+    one stage are taken off the cost, which does not change the plan. The reduced cost is small
+    where the plan has mass, and is cut above a limit for the next stage: a million, then a thousand
+    times the typical cost, so that the solver resolves ever smaller differences.
     """
     scaled_cost, minimum, scale = scale_cost(cost)
     plan, potential = solve(scaled_cost, a, b)
@@ -261,7 +270,8 @@ def _solve_in_stages(
         cost = cost - cost.min(axis=1, keepdims=True)
         scaled_cost, minimum, scale = scale_cost(np.minimum(cost, limit))
         trial, potential = solve(scaled_cost, a, b)
-        # Equal masses are so to rounding only; more mass above the limit is needed there.
+        # Costs were cut at the limit. If the plan needs links above it, it is not the optimal one,
+        # and that of the last stage stays. (Some 1e-12 of mass may be there by rounding.)
         if trial[cost > limit].sum() > 1e-12:
             break
         plan = trial
@@ -320,7 +330,7 @@ def transform_ensemble(
     """
     weights = normalize_weights(log_weights, ensemble.shape[:-1])
     solve = solver_of(solver, regularisation)
-    # X+ = X N T.
+    # X⁺ = X N T, with members as columns.
     plans = _solve_plans(ensemble, weights, solve, cost)
     transformed = apply_plan(ensemble, weights, plans)
     if debias:
@@ -333,20 +343,24 @@ def transform_ensemble(
         transformed += weights[..., None, :] @ ensemble - mean
     if not correct:
         return transformed
-    return _correct_moments(transformed, ensemble, weights)
+    return _match_weighted_moments(transformed, ensemble, weights)
 
 
 def apply_plan(
     ensemble: Array, weights: Array, plan: Array, *, correct: bool = False
 ) -> Array:
-    """Transform weighted members with a coupling of the weights to equal masses, (3)."""
-    # About the weighted mean, so that members far from the origin lose no digits.
+    """Transform members (..., N, d) with weights (..., N) by a coupling (..., N, N).
+
+    Equation (3) of Das and Bhattacharya. With `correct` the moments become the weighted ones.
+    """
+    # x_j = m + N sum_i t_ij (x_i - m), since column j of the plan has the mass 1/N. About the
+    # weighted mean m, so that members far from the origin lose no digits.
     mean = weights[..., None, :] @ ensemble
     shift = ensemble.shape[-2] * (plan.mT @ (ensemble - mean))
     transformed = np.asarray(mean + shift)
     if not correct:
         return transformed
-    return _correct_moments(transformed, ensemble, weights)
+    return _match_weighted_moments(transformed, ensemble, weights)
 
 
 @validated
@@ -391,11 +405,16 @@ def correct_moments(
     0.1875
     """
     weights = normalize_weights(log_weights, ensemble.shape[:-1])
-    return _correct_moments(transformed, ensemble, weights)
+    return _match_weighted_moments(transformed, ensemble, weights)
 
 
-def _correct_moments(transformed: Array, ensemble: Array, weights: Array) -> Array:
-    """Give members (..., N, d) the weighted mean and covariance of the ensemble."""
+def _match_weighted_moments(
+    transformed: Array, ensemble: Array, weights: Array
+) -> Array:
+    """Give members (..., N, d) the weighted mean and covariance of the ensemble.
+
+    The map is that of :func:`correct_moments`.
+    """
     n = ensemble.shape[-2]
     mean = weights[..., None, :] @ ensemble
     prior_anomalies = ensemble - mean
@@ -407,18 +426,22 @@ def _correct_moments(transformed: Array, ensemble: Array, weights: Array) -> Arr
     # orthonormal ones nearest to A K. P comes out to rounding, however small C is.
     product = anomalies @ root
     u, sizes, vt = np.linalg.svd(product, full_matrices=False)
-    u = u * (sizes[..., None, :] > _rounding(transformed, product, root, vt.mT, n))
-    # Rounding leaves the directions a small mean.
+    # Directions without spread get none.
+    noise = _singular_value_noise(transformed, product, root, vt.mT, n)
+    u = u * (sizes[..., None, :] > noise)
+    # The columns of U have mean zero, but for rounding.
     u -= u.mean(axis=-2, keepdims=True)
     return np.asarray(mean + np.sqrt(n) * (u @ vt @ root.mT))
 
 
-def _rounding(
+def _singular_value_noise(
     transformed: Array, product: Array, root: Array, axes: Array, n: int
 ) -> Array:
-    """Return the singular values of anomalies times root that rounding alone can cause.
+    """Return the singular values, (..., 1, d), that rounding of an SVD's argument can cause.
 
-    Rounding of the members enters through the root, rounding of the product directly.
+    The argument is the `product` (..., N, d) of anomalies of the `transformed` members and the
+    `root` (..., d, d), with right singular vectors `axes` (..., d, d). Rounding of the members
+    enters through the root, rounding of the product directly.
     """
     member_size = np.abs(transformed).max(axis=-2, keepdims=True)
     column_size = np.abs(product).max(axis=-2, keepdims=True)
@@ -427,10 +450,10 @@ def _rounding(
 
 
 def _factor_by_size(covariance: Array) -> Array:
-    """Return a factor K of covariances K K', triangular from the widest component to the narrowest.
+    """Return a factor K of covariances K K', (..., d, d): a Cholesky factor with sorted components.
 
-    Its columns then shrink as the components do, and a small unit does not vanish in the rounding
-    of a large one.
+    They are sorted by their variances, the largest first. The columns of the factor then shrink as
+    the components do, and a small unit does not vanish in the rounding of a large one.
     """
     variances = np.diagonal(covariance, axis1=-2, axis2=-1)
     order = np.argsort(-variances, axis=-1, kind="stable")
@@ -534,7 +557,7 @@ def transform_within(
     # Row p marks the members of piece p.
     membership = (index == np.arange(labels.size)[:, None]).astype(np.float64)
     choice = _choose_rows(membership @ plan, rng)
-    # Column j keeps the masses from its chosen piece only, and averages with them.
+    # New member j is the average of the mass that comes to it from its chosen piece.
     masses = plan * membership[choice].T
     return np.asarray(masses.T @ ensemble / masses.sum(axis=0)[:, None])
 
@@ -542,11 +565,14 @@ def transform_within(
 def _choose_rows(probabilities: Array, rng: Rng) -> Indices:
     """Choose a row for each column, with the column's probabilities and hardly varying totals.
 
-    Row by row, the columns without a choice are laid end to end, each as long as its conditional
-    probability, and those that contain a level k + u choose the row.
+    Each column of the probabilities (P, N) sums to one; the result is (N,). The rows take their
+    turns. The columns that have not chosen yet are laid end to end, each as long as its probability
+    of this row, given that it chose none before. The columns that contain one of the levels k + u,
+    with integers k and one uniform number u, choose the row.
     """
     n_rows, n_columns = probabilities.shape
     undecided = np.arange(n_columns)
+    # A column that chooses no other row gets the last.
     choice = np.full(n_columns, n_rows - 1)
     # Probability of a row or a later one, in every column.
     tail = np.cumsum(probabilities[::-1], axis=0)[::-1]

@@ -111,7 +111,8 @@ def _decode(
     densities = values[:, :-1]
     if modes is not None:
         densities = densities @ snapshot.grid.cosines(modes).T
-    # The average of the leader's indicator is 1/N; a transient may be zero or negative.
+    # The last value is 1 for the leader and 0 for all others, so its average is 1/N. Before the
+    # consensus has converged it may be zero or negative: 1 to a million agents are believed.
     agents = 1 / np.clip(values[:, -1], 1e-6, 1.0)
     return densities, agents
 
@@ -161,7 +162,7 @@ class PIConsensus(FrozenModel, ConsensusProtocol):
     def update(
         self, memory: Memory, snapshot: SwarmSnapshot, channel: Channel, dt: float
     ) -> Update:
-        """Integrate (16) over `dt`, in as many substeps as stability needs."""
+        """Integrate (16) of Zheng and Lin over `dt`, in as many substeps as stability needs."""
         estimates, integrals, previous = memory
         inputs = _encode(snapshot, self.modes, snapshot.kernels)
         # The estimates follow the average of the previous inputs.

@@ -54,20 +54,24 @@ class Flooding(FrozenModel, ConsensusProtocol):
             # For each agent the entry with the latest time.
             newest = tables[..., -1].argmax(axis=0)
             latest[i] = tables[newest, agents]
-        # Half of NEVER separates entries from none.
+        # A missing entry has the time _NEVER, which is below this limit; all real times are above.
         oldest = _NEVER / 2 if self.forget is None else snapshot.t - self.forget
         densities, counts = _average_kernels(latest, oldest, snapshot)
         return (latest,), densities, counts
 
 
 def _empty_table(snapshot: SwarmSnapshot) -> Array:
+    """Return tables (A, A, d + 1) without entries: row (i, j) is agent i's knowledge of j.
+
+    A row has the position and, last, its time, which is `_NEVER`.
+    """
     agents, d = snapshot.positions.shape
     entry = [0.0] * d + [_NEVER]
     return np.full((agents, agents, d + 1), entry)
 
 
 def _insert_positions(snapshot: SwarmSnapshot, table: Array) -> Array:
-    """Copy the tables, and insert each agent's present position and time in its own."""
+    """Copy tables (A, A, d + 1), and insert each agent's present position and time in its own."""
     result = table.copy()
     i = np.flatnonzero(snapshot.present)
     result[i, i, :-1] = snapshot.positions[i]
@@ -78,9 +82,24 @@ def _insert_positions(snapshot: SwarmSnapshot, table: Array) -> Array:
 def _average_kernels(
     table: Array, oldest: float, snapshot: SwarmSnapshot
 ) -> tuple[Array, Array]:
-    """Kernel estimates from each table's entries after `oldest`, and their numbers.
+    """Average the kernels at the entries of each agent's table that are later than `oldest`.
 
-    Kernels of equal entries are computed once.
+    Many tables have the same entry, whose kernel is computed once.
+
+    Parameters
+    ----------
+    table : ndarray, (A, A, d + 1)
+        Row (i, j) is agent j's position as agent i knows it, and, last, the time of it.
+    oldest : float
+        Entries of this time or before are left out, in s.
+    snapshot : SwarmSnapshot
+
+    Returns
+    -------
+    densities : ndarray, (A, n)
+        Zero for a table without entries, and for agents that are not local.
+    counts : ndarray, (A,)
+        Number of entries in each average.
     """
     recent = table[..., -1] > oldest
     counts = recent.sum(axis=1).astype(np.float64)
@@ -88,18 +107,18 @@ def _average_kernels(
         others = np.delete(np.arange(len(recent)), snapshot.local)
         # The kernels of others are not needed, but their counts are.
         recent[others] = False
-    row, agent = np.nonzero(recent)
+    owner, agent = np.nonzero(recent)
     # An entry is identified by its agent and its time.
-    entries = np.stack([agent, table[row, agent, -1]], axis=1)
-    _, first, inverse = np.unique(
+    entries = np.stack([agent, table[owner, agent, -1]], axis=1)
+    # Different entries: where each occurs first, and which of them every entry is.
+    _, first, number = np.unique(
         entries, axis=0, return_index=True, return_inverse=True
     )
-    # One kernel for each different entry.
-    positions = table[row[first], agent[first], :-1]
+    positions = table[owner[first], agent[first], :-1]
     z = kernels(positions, snapshot.grid, bandwidth=snapshot.bandwidth)
     weights = np.zeros((len(table), len(positions)))
     # Row i averages the kernels of the entries in table i.
-    weights[row, inverse] = 1.0
+    weights[owner, number] = 1.0
     # A table without entries gives zero.
     totals = np.maximum(weights.sum(axis=1, keepdims=True), 1.0)
     return np.asarray(weights @ z / totals), counts

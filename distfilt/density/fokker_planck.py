@@ -37,7 +37,8 @@ def bernoulli(z: Annotated[ArrayInput, "..."]) -> Array:
     array([1.581977, 1.      , 0.581977])
     """
     small = np.abs(z) < 1e-4
-    # Near zero by its Taylor series; far from it, expm1 does not overflow below 700.
+    # Near zero by its Taylor series, whose next term, -z⁴/720, is below rounding. Far from it z is
+    # clipped at 700, since exp(710) overflows.
     series = 1 - z / 2 + z**2 / 12
     nonzero = np.where(small, 1.0, z)
     ratio = nonzero / np.expm1(np.clip(nonzero, -700.0, 700.0))
@@ -135,7 +136,10 @@ class FokkerPlanck(FrozenModel):
         return _Faces(points, lower, upper, axis, grid.spacing[axis])
 
     def _rates(self, t: float) -> tuple[Array, Array]:
-        """Rates at which mass crosses each face, forwards and backwards, in 1/s."""
+        """Rates at which mass crosses each face, forwards and backwards, in 1/s, (f,) each.
+
+        They are the factors of p_l and p_r in Scharfetter and Gummel's flux F, divided by Δ.
+        """
         faces = self._faces
         # Only the components across each face matter.
         across = np.arange(faces.axis.size), faces.axis
@@ -144,7 +148,8 @@ class FokkerPlanck(FrozenModel):
         # Péclet number z = v Δ/D at the face
         peclet = drift * faces.width / diffusion
         # Rates B(-z) D/Δ² forwards and B(z) D/Δ² backwards, with B(z) = z / (exp(z) - 1).
-        # B(-z) = z + B(z): one exponential serves both directions, without cancellation.
+        # Since B(-z) = z + B(z), they are B(|z|) + max(z, 0) and B(|z|) + max(-z, 0), without
+        # cancellation, and one exponential serves both directions.
         weight = bernoulli(np.abs(peclet))
         forwards = weight + np.maximum(peclet, 0.0)
         backwards = weight + np.maximum(-peclet, 0.0)
@@ -219,10 +224,10 @@ class FokkerPlanck(FrozenModel):
         return step
 
     def _split_solver(self, t: float, dt: float) -> Callable[[Array], Array]:
-        """Backward Euler along one axis after the other, all lines of an axis at once.
+        """Return a step of backward Euler along one axis after the other.
 
-        The tridiagonal elimination has no subtraction, so that no rounding makes a density
-        negative.
+        All lines of cells along an axis are solved at once. The tridiagonal elimination has no
+        subtraction, so that no rounding makes a density negative.
         """
         grid = self.grid
         # Backward Euler uses the rates at the end of the step.
@@ -234,7 +239,8 @@ class FokkerPlanck(FrozenModel):
             factors.append(_factorize_tridiagonal(up, down))
 
         def step(p: Array) -> Array:
-            # Densities last: each operation runs over contiguous memory.
+            # The axes of the grid first, densities (k of them) last: each operation then runs over
+            # contiguous memory. `x` is overwritten by the solution.
             columns = np.array(p.reshape(-1, grid.size).T, order="C")
             x = columns.reshape(*grid.shape, -1)
             for k, axis_factors in enumerate(factors):
@@ -269,9 +275,19 @@ class FokkerPlanck(FrozenModel):
 def _factorize_tridiagonal(
     forwards: Array, backwards: Array
 ) -> tuple[Array, Array, Array]:
-    """Factors of I - Δ A along the first axis: lower, upper, and the reciprocal pivots.
+    """Factor the tridiagonal matrices I - Δ A of all lines of cells along the first axis.
 
-    Column i of the matrix is (-backwards[i-1], 1 + both rates out of cell i, -forwards[i]).
+    Column i of a matrix is (-backwards[i-1], 1 + both rates out of cell i, -forwards[i]).
+
+    Parameters
+    ----------
+    forwards, backwards : ndarray, (n - 1, ...)
+        Rates times the step Δ at the faces between n cells: f_i from cell i to i + 1, and b_i back.
+
+    Returns
+    -------
+    lower, upper, reciprocals : ndarray, (n - 1, ..., 1), the same and (n, ..., 1)
+        f_i / p_i and b_i / p_i with the pivots p_i of Gauss's elimination, and 1 / p_i.
     """
     pivots = np.ones((len(forwards) + 1, *forwards.shape[1:]))
     # The pivot without the rate forwards: d_0 = 1, d_{i+1} = 1 + b_i d_i/(d_i + f_i).
@@ -290,10 +306,14 @@ def _factorize_tridiagonal(
 def _solve_tridiagonal(
     x: Array, lower: Array, upper: Array, reciprocals: Array
 ) -> None:
-    """Solve in place along the first axis, by forward and backward substitution."""
+    """Solve for densities x (n, ..., k) in place along the first axis, by substitution.
+
+    The factors are those of `_factorize_tridiagonal`.
+    """
+    # Forward: y_{i+1} = x_{i+1} + (f_i / p_i) y_i.
     for i in range(len(lower)):
         x[i + 1] += lower[i] * x[i]
-    # The last row has no neighbour above.
+    # Backward: x_i = y_i / p_i + (b_i / p_i) x_{i+1}; the last cell has no neighbour above.
     x[-1] *= reciprocals[-1]
     for i in range(len(upper) - 1, -1, -1):
         x[i] *= reciprocals[i]

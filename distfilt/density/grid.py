@@ -191,8 +191,8 @@ class Grid(FrozenModel):
         k = np.stack([axis.ravel() for axis in np.indices(self.shape)], axis=-1)
         relative_width = self.width / self.width.max()
         squares = ((k / relative_width) ** 2).sum(axis=-1)
-        # Compared to nine digits: rounding errors would order symmetric modes differently on
-        # another machine or in another unit.
+        # Rounded to nine digits: modes of a square box come in pairs of equal frequency, and their
+        # order must not depend on rounding errors, which differ between machines and units.
         mantissa, exponent = np.frexp(squares)
         frequency = np.ldexp(mantissa.round(9), exponent)
         # The last key of lexsort is the first criterion; then k along axis 0, axis 1, ...
@@ -272,11 +272,11 @@ def zero_mean_prior(
     ((900, 50), True)
     """
     Bounds(below=grid.size)(rank, "rank")
-    # Beyond a million sides the lowest mode alone remains anyway.
+    # A longer length leaves only the lowest mode; the bound avoids an overflow of its square.
     ell = 0.1 * grid.side if length is None else min(length, 1e6 * grid.side)
     # |k|² of the modes without the constant one
     squares = ((grid.wavenumbers(grid.size)[1:] / grid.width) ** 2).sum(axis=-1)
-    # Relative to the lowest mode, which then remains if a length beyond the box underflows others.
+    # Relative to the lowest mode: it stays 1 where a long length makes all others zero.
     spectrum = np.exp(-0.5 * (np.pi * ell) ** 2 * (squares - squares[0]))
     # Each mode has the mean square 1/volume of the box.
     scale = np.sqrt(spectrum[:rank] / (spectrum.sum() / grid.box_volume))

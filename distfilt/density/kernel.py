@@ -44,16 +44,25 @@ _NO_DISTANCE = 1e-9
 """Positions that agree to this part of the box's width are the same place."""
 
 
+_REACH = 9
+"""Beyond so many standard deviations a Gaussian has a mass of 2e-19, less than rounding."""
+
+
 def _axis_kernels(x: Array, grid: Grid, k: int, width: Array) -> Array:
-    """Means of reflected kernels at x (...) over the cells of axis k, (..., n_k)."""
+    """Means of reflected kernels over the cells of axis k, (..., n_k).
+
+    The kernels are at coordinates x (...) along this axis, with standard deviations `width` (...).
+    """
     edges = grid.edges[k]
     low = edges[0]
     span = edges[-1] - low
+    # The normal distribution function of u is (1 + erf(u / (√2 σ))) / 2.
     scale = np.sqrt(2.0) * width[..., None]
     mass = _cell_masses(x, edges, scale)
-    # Reflection at both walls adds images, at x + 2 m span and 2 low - x + 2 (m + 1) span.
-    # Those more than nine widths outside the box contribute nothing.
-    reach = 9 * float(np.max(width, initial=0.0)) / span
+    # Reflection at both walls adds images, at x + 2 m span and 2 low - x + 2 (m + 1) span. Measured
+    # in spans, the first kind lies at least 2 |m| - 1 outside the box, and the second kind
+    # 2 m above it for m >= 0, or -2 m - 2 below it. Images beyond the reach are left out.
+    reach = _REACH * float(np.max(width, initial=0.0)) / span
     orders = int(reach / 2 + 1)
     for m in range(-orders, orders + 1):
         if m != 0 and 2 * abs(m) - 1 < reach:
@@ -65,20 +74,36 @@ def _axis_kernels(x: Array, grid: Grid, k: int, width: Array) -> Array:
 
 
 def _cell_masses(x: Array, edges: Array, scale: Array) -> Array:
-    """Integrals of a Gaussian at x over the intervals between the edges."""
+    """Integrals of Gaussians at x (...) over the intervals between edges (n + 1,), as (..., n).
+
+    `scale` (..., 1) is √2 times the standard deviation.
+    """
     from scipy.special import erf
 
     return np.asarray(0.5 * np.diff(erf((edges - x[..., None]) / scale), axis=-1))
 
 
+_WIDEST = 20
+"""A kernel wider than so many boxes is flat, and its width probably in another unit."""
+
+
 def check_resolution(grid: Grid, bandwidth: float | Array) -> None:
-    """Refuse bandwidths below half a cell, or far wider than the box; warn of a flat axis."""
+    """Refuse bandwidths below half a cell, or far wider than the box; warn of a flat axis.
+
+    A narrower kernel would fall into one cell, whatever its width: the cells cannot show it.
+
+    Parameters
+    ----------
+    grid : Grid
+    bandwidth : float or ndarray, (N,), (1, d) or (N, d)
+        As in :func:`kernels`.
+    """
     if np.ndim(bandwidth) == 2:
         _check_axis_widths(grid, np.asarray(bandwidth))
         return
-    if np.max(bandwidth) > 20 * grid.width.max():
+    if np.max(bandwidth) > _WIDEST * grid.width.max():
         raise ValueError(
-            f"bandwidth must be at most 20 widths of the box, got {bandwidth}"
+            f"bandwidth must be at most {_WIDEST} widths of the box, got {bandwidth}"
         )
     least = float(np.min(bandwidth))
     widest = float(grid.spacing.max())
@@ -100,13 +125,14 @@ def check_resolution(grid: Grid, bandwidth: float | Array) -> None:
 
 
 def _check_axis_widths(grid: Grid, bandwidth: Array) -> None:
-    """Refuse bandwidths (..., d) below half a cell, or far wider than the box, on any axis."""
-    if (bandwidth > 20 * grid.width).any():
+    """Do as `check_resolution` with bandwidths (1, d) or (N, d), along every axis by itself."""
+    if (bandwidth > _WIDEST * grid.width).any():
         raise ValueError(
-            "bandwidth must be at most 20 widths of the box along every axis, got "
+            f"bandwidth must be at most {_WIDEST} widths of the box along every axis, got "
             f"{bandwidth.max(axis=0).tolist()}"
         )
     least = bandwidth.min(axis=0)
+    # With the same tolerance of rounding
     if (grid.spacing > 2 * least * (1 + 1e-12)).any():
         raise ValueError(
             "grid must have cells no wider than two bandwidths along every axis, "
@@ -114,8 +140,13 @@ def _check_axis_widths(grid: Grid, bandwidth: Array) -> None:
         )
 
 
-def _factors(positions: Array, grid: Grid, bandwidth: float | Array) -> list[Array]:
-    """Factors (..., N, n_k) of each agent's kernel, one for each axis."""
+def _axis_factors(
+    positions: Array, grid: Grid, bandwidth: float | Array
+) -> list[Array]:
+    """Factors (..., N, n_k) of each agent's kernel, one array for each axis k.
+
+    A Gaussian with independent components is the product of its factors along the axes.
+    """
     check_resolution(grid, bandwidth)
     grid._check_inside(positions)
     if np.ndim(bandwidth) == 2:
@@ -131,7 +162,10 @@ def _factors(positions: Array, grid: Grid, bandwidth: float | Array) -> list[Arr
 
 
 def _outer_products(product: Array, factors: list[Array]) -> Array:
-    """Outer product of each agent's first factor with the others, flattened, (..., N, n)."""
+    """Multiply each agent's factor (..., N, n_1) by those of the other axes, as (..., N, n).
+
+    n is the number of cells of these axes together, the last axis fastest.
+    """
     for factor in factors:
         product = product[..., :, None] * factor[..., None, :]
         product = product.reshape(*product.shape[:-2], -1)
@@ -188,7 +222,7 @@ def kernels(
     ... )
     True
     """
-    factors = _factors(positions, grid, bandwidth)
+    factors = _axis_factors(positions, grid, bandwidth)
     return _outer_products(factors[0], factors[1:])
 
 
@@ -212,7 +246,7 @@ def kernel_density(
     >>> round(float(p.max() * 2 * np.pi * 0.1**2), 2)
     0.92
     """
-    factors = _factors(positions, grid, bandwidth)
+    factors = _axis_factors(positions, grid, bandwidth)
     first = factors[0]
     ones = np.ones((*first.shape[:-1], 1))
     # The sum over agents is the product of two matrices, (n_1, N) and (N, n / n_1).
@@ -379,14 +413,16 @@ def _number_places(x: Array, grid: Grid) -> Indices | None:
 
 
 def _rounding_steps(x: Array, grid: Grid) -> Array:
-    """Return the steps (d,) to which the positions of agents with ties are rounded, or zero."""
+    """Return for each axis the step to which positions (N, d) are rounded, or zero, as (d,)."""
     return np.array(
         [_lattice_step(x[:, k], float(grid.width[k])) for k in range(grid.dim)]
     )
 
 
 def _undo_rounding(x: Array, grid: Grid, step: Array) -> Array:
-    """Spread agents (N, d) over the intervals that were rounded, evenly and without draws.
+    """Spread agents x (N, d) over the intervals that were rounded, evenly and without draws.
+
+    A position that was rounded to a multiple of `step` (d,) lay within half a step of it.
 
     >>> line = Grid((9,), high=9.0)
     >>> x = np.array([[3.0], [3.0], [4.0], [7.0]])
@@ -396,7 +432,8 @@ def _undo_rounding(x: Array, grid: Grid, step: Array) -> Array:
     if not step.any():
         return x
     # Multiples of irrational numbers, taken modulo one, fill the unit interval evenly; agents in
-    # one place are next to each other in this order.
+    # one place are next to each other in this order. For the axes k = 1, 2, 3 the number is 1/φ
+    # with φ^(k + 1) = φ + 1; the first φ is the golden ratio.
     ratios = np.array([0.6180339887, 0.7548776662, 0.8191725134])[: grid.dim]
     ranks = np.empty(len(x))
     ranks[np.lexsort(x.T)] = np.arange(len(x))
@@ -411,12 +448,13 @@ def _undo_rounding(x: Array, grid: Grid, step: Array) -> Array:
 def _lattice_step(values: Array, width: float) -> float:
     """Return the step of the lattice on which tied coordinates lie; 0 without ties or lattice."""
     unique = np.unique(np.round(values / (_NO_DISTANCE * width)))
+    # Without ties, or with all in one place, nothing shows a lattice.
     if not 1 < len(unique) < len(values):
         return 0.0
     differences = np.diff(unique)
     step = float(differences.min())
     multiples = differences / step
-    # All differences are multiples of the smallest, but for rounding.
+    # All differences are multiples of the smallest, but for rounding: to a hundredth of it.
     is_lattice = np.abs(multiples - np.round(multiples)).max() < 0.01
     return step * _NO_DISTANCE * width if is_lattice else 0.0
 
@@ -431,7 +469,8 @@ def _cross_validation_score(
     n = len(x)
     z = kernels(x, grid, bandwidth=h)
     mean = z.mean(axis=0)
-    # Entry (i, j) is the kernel of agent i in the cell of agent j; the diagonal is left out.
+    # Entry (i, j) is the kernel of agent i in the cell of agent j; the diagonal, an agent's kernel
+    # in its own cell, is left out.
     pairs = z[:, grid.cell_index(x)]
     if places is None:
         leave_one_out = (pairs.sum() - np.trace(pairs)) / (n * (n - 1))

@@ -126,7 +126,7 @@ def _noise_strength(noise: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 _MAX_CONDITION = 1e15
-"""Condition number of the information from which on rounding errors dominate."""
+"""Condition number of the information from which on rounding errors, of 1e-16, dominate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,10 +312,10 @@ def low_rank_step(
     """
     # Δ/R of each cell, zero where nothing is measured
     precision = dt / _noise_strength(noise, state.base.shape)
-    # R⁻¹ Δ (y - base): the innovation of the base, not of the estimate
-    innovation = precision * (observed - state.base)
-    # Sᵀ of each row, in a common basis or in one for each filter
-    increment = (innovation[:, None, :] @ state.basis)[:, 0]
+    # Δ R⁻¹ (y - base), (F, n): the difference from the base, not from the estimate
+    weighted = precision * (observed - state.base)
+    # Δ Sᵀ R⁻¹ (y - base), (F, r), in a common basis or in one for each filter
+    increment = (weighted[:, None, :] @ state.basis)[:, 0]
     information = state.information + _gram_matrices(state.basis, precision)
     # The least eigenvalue is 1 or more: without large entries no matrix is ill-conditioned.
     if not information.max() < _MAX_CONDITION:
@@ -336,11 +336,19 @@ def _check_condition(information: Array) -> None:
         )
 
 
+_MANY_FILTERS = 16
+"""From so many filters on, forming each product of two columns once is faster."""
+
+
 def _gram_matrices(s: Array, weights: Array) -> Array:
-    """Sᵀ diag(w) S for each row w of the weights, (F, r, r)."""
-    if s.ndim == 3 or len(weights) < 16:
+    """Sᵀ diag(w) S, (F, r, r), for each row w of the weights (F, n).
+
+    The basis s is common to all filters, (n, r), or has an axis of filters, (F, n, r).
+    """
+    if s.ndim == 3 or len(weights) < _MANY_FILTERS:
         return np.asarray((s.mT * weights[:, None, :]) @ s)
-    # Many filters of one basis: each product of two columns is formed once, by symmetry for j >= i.
+    # Entry (i, j) is Σ_c w_c S_ci S_cj over the cells c: one product of the weights with S_ci S_cj
+    # serves all filters. By symmetry only j >= i is computed.
     columns = np.ascontiguousarray(s.T)
     rank = len(columns)
     products = np.empty((len(weights), rank, rank))

@@ -118,7 +118,8 @@ class SwarmSnapshot(FrozenModel):
         counts = np.where(self.present, np.maximum(agents, 1.0), 0.0)
         if self.local is not None:
             counts = counts[list(self.local)]
-        # k̄ falls as 1/N; without any agent it is infinite.
+        # The constant k̄ is that of one agent, divided by the number of agents.
+        # Absent agents, without a kernel, have an infinite one.
         single = kernel_constant(self.grid, bandwidth=self.bandwidth, agents=1)
         constant = np.full(counts.shape, np.inf)
         np.divide(single, counts, out=constant, where=counts > 0)

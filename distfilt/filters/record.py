@@ -515,7 +515,8 @@ def _score(summary: Summary, truth: Array, known: _KnownTruth) -> dict[str, Arra
     """Return the scores of a summary.
 
     Components are scored one by one where their truth is given. Those that are scored together
-    have a nees and a total where their estimates and their truth are all finite, NaN elsewhere.
+    have a nees and a total where their estimates and their truth are all finite, NaN elsewhere. An
+    overflowing covariance has no nees either.
     """
     result: dict[str, Array] = {}
     scores = known.scores
@@ -533,15 +534,17 @@ def _score(summary: Summary, truth: Array, known: _KnownTruth) -> dict[str, Arra
         else:
             value = crps(summary.members, truth, weights=summary.weights)
         result["crps"] = np.where(np.isfinite(mean - truth), value, np.nan)
-    cov = _known_covariance(summary, known.components) if "nees" in scores else None
+    cov = _covariance_of(summary, known.components) if "nees" in scores else None
     if cov is not None:
+        # A spread that overflows beside a finite mean has no inverse.
+        has_nees = is_scored & np.isfinite(cov).all(axis=(-2, -1))
         nees = np.full(is_scored.shape, np.nan)
-        nees[is_scored] = _nees(together[is_scored], cov[is_scored])
+        nees[has_nees] = _nees(together[has_nees], cov[has_nees])
         result["nees"] = nees
     return result
 
 
-def _known_covariance(summary: Summary, components: Components) -> Array | None:
+def _covariance_of(summary: Summary, components: Components) -> Array | None:
     """Return the covariance of the known components; None if the summary has none."""
     if summary.covariance is not None:
         rows = _select(summary.covariance, components, behind=1)

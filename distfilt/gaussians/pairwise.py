@@ -53,7 +53,7 @@ More would let rounding decide which of two points is the better one."""
 _MARGIN = 1e-6
 """Smallest distance of a weight that is searched for from 0 and 1."""
 _TIE = 1e-9
-"""Relative difference of variances that count as equal."""
+"""Relative difference of variances that count as equal: rounding makes smaller ones."""
 
 
 @validated
@@ -96,6 +96,7 @@ def intersect_inverses(
     >>> mean.round(6), cov.round(6)
     (array([0.6]), array([[1.2]]))
     """
+    # P_a = T Tᵀ, P_b = T D Tᵀ and z = T⁻¹ (m_b - m_a)
     transform, d, z = _diagonalise(mean_a, cov_a, mean_b, cov_b)
     # tr T diag(p) Tᵀ = Σ_k p_k |t_k|² with the columns t_k
     scale = (transform**2).sum(axis=-2)
@@ -107,11 +108,11 @@ def intersect_inverses(
         return np.asarray(1 / (1 + 1 / d - 1 / (w + (1 - w) * d)))
 
     def size(weights: Array) -> Array:
-        # The points of the search come last: (..., points).
+        """Return tr P or log det P but for a constant, for weights, both (..., points)."""
         p = np.stack([variances(w) for w in np.moveaxis(weights, -1, 0)], axis=-2)
-        # log det P is Σ log p_k and a constant.
         if rule == "min_trace":
             return np.asarray((scale[..., None, :] * p).sum(axis=-1))
+        # log det P = Σ log p_k + 2 log |det T|
         return np.asarray(np.log(p).sum(axis=-1))
 
     weight = _choose_weight(omega, size, d.shape[:-1])
@@ -119,7 +120,7 @@ def intersect_inverses(
     w = weight[..., None]
     # The gain of b: P (P_b⁻¹ - (1 - ω) (ω P_a + (1 - ω) P_b)⁻¹)
     gain = p * (1 / d - (1 - w) / (w + (1 - w) * d))
-    return _return_from(transform, mean_a, gain * z, p)
+    return _transform_back(transform, mean_a, gain * z, p)
 
 
 @validated
@@ -131,10 +132,11 @@ def intersect_ellipsoids(
     .. math:: \mathbf P^{-1}=\mathbf P_a^{-1}+\mathbf P_b^{-1}-\boldsymbol\Gamma^{-1},\qquad
         \boldsymbol\Gamma=\mathbf T\max(\mathbf I,\mathbf D)\mathbf T^\top
 
-    All information that both could have in common, :math:`\boldsymbol\Gamma^{-1}`, is counted
-    once: along each axis of the common coordinates the more accurate of the two is taken, and
-    where both are equally accurate the mean of them. P is the largest covariance that is below
-    both; it is no bound of the error for every correlation.
+    in the coordinates common to both, :math:`\mathbf P_a=\mathbf T\mathbf T^\top` and
+    :math:`\mathbf P_b=\mathbf T\mathbf D\mathbf T^\top`. All information that both could have in
+    common, :math:`\boldsymbol\Gamma^{-1}`, is counted once: along each axis of these coordinates
+    the more accurate of the two is taken, and where both are equally accurate the mean of them. P
+    is the largest covariance that is below both; it is no bound of the error for every correlation.
 
     Parameters
     ----------
@@ -154,10 +156,12 @@ def intersect_ellipsoids(
     (array([0., 1.]), array([[1., 0.],
            [0., 3.]]))
     """
+    # P_a = T Tᵀ, P_b = T D Tᵀ and z = T⁻¹ (m_b - m_a)
     transform, d, z = _diagonalise(mean_a, cov_a, mean_b, cov_b)
-    # The limit of the paper's (16) for η to zero: all weight on the smaller variance.
+    # The limit of the paper's (16) for η to zero: all weight is on the smaller variance, so that
+    # the gain of b is 1 where D < I, and 0 where D > I.
     gain = np.where(np.abs(d - 1) < _TIE, 0.5, (d < 1).astype(np.float64))
-    return _return_from(transform, mean_a, gain * z, np.minimum(1.0, d))
+    return _transform_back(transform, mean_a, gain * z, np.minimum(1.0, d))
 
 
 @validated
@@ -220,7 +224,10 @@ def intersect_split(
     )
 
     def informations(weight: Array) -> tuple[Array, Array]:
-        """Return A⁻¹ and B⁻¹ = ω (D + ω I)⁻¹ without a division by the weight."""
+        """Return A⁻¹ = ω (D_a + ω I_a)⁻¹ and B⁻¹ likewise with 1 - ω, (..., d, d).
+
+        So nothing is divided by a weight, which may be zero.
+        """
         w = weight[..., None, None]
         unit = np.broadcast_to(np.eye(d), (*weight.shape, d, d))
         a = w * solve_definite(dependent_a + w * independent_a, unit)
@@ -228,14 +235,16 @@ def intersect_split(
         return a, b
 
     def size(weights: Array) -> Array:
+        """Return log det P or tr P, (..., points), for weights (..., points)."""
         values = []
         for weight in np.moveaxis(weights, -1, 0):
             a, b = informations(weight)
+            # P⁻¹ = A⁻¹ + B⁻¹ = C Cᵀ
             lower = cholesky(symmetrise(a + b))
             if rule == "min_determinant":
                 values.append(-log_det(lower))
             else:
-                # tr P = |C⁻¹|² for P⁻¹ = C Cᵀ
+                # tr P = |C⁻¹|²
                 root = solve_lower(lower, np.broadcast_to(np.eye(d), lower.shape))
                 values.append((root**2).sum(axis=(-2, -1)))
         return np.stack(values, axis=-1)
@@ -301,16 +310,20 @@ def unite_gaussians(
 
     def cover(weight: Array) -> Array:
         """Return a factor of the smallest covariance above both, (..., d, d)."""
+        # The two on the right of the inequalities.
         w = weight[..., None, None]
         first = cov_a + w**2 * square
         second = cov_b + (1 - w) ** 2 * square
+        # In the coordinates common to both they are I and D. Means do not matter here.
         transform, d, _ = _diagonalise(difference, first, difference, second)
-        # T max(1, D) Tᵀ
+        # P = T max(I, D) Tᵀ
         return np.asarray(transform * np.sqrt(np.maximum(1.0, d))[..., None, :])
 
     def size(weights: Array) -> Array:
+        """Return tr P or half of log det P, (..., points), for weights (..., points)."""
         factors = np.stack([cover(w) for w in np.moveaxis(weights, -1, 0)], axis=-3)
         if rule == "min_trace":
+            # tr F Fᵀ = |F|²
             return np.asarray((factors**2).sum(axis=(-2, -1)))
         return np.asarray(np.linalg.slogdet(factors)[1])
 
@@ -322,7 +335,7 @@ def unite_gaussians(
 def _broadcast_pair(
     mean_a: Array, cov_a: Array, mean_b: Array, cov_b: Array
 ) -> tuple[int, ...]:
-    """Return the leading axes to which two Gaussians broadcast."""
+    """Return the leading axes to which means (..., d) and covariances (..., d, d) broadcast."""
     leading = broadcast_leading(mean_a.shape[:-1], mean_b.shape[:-1], "mean_b")
     leading = broadcast_leading(leading, cov_a.shape[:-2], "cov_a")
     return broadcast_leading(leading, cov_b.shape[:-2], "cov_b")
@@ -348,10 +361,14 @@ def _diagonalise(
     return lower @ axes, d, z[..., 0]
 
 
-def _return_from(
+def _transform_back(
     transform: Array, mean_a: Array, shift: Array, variances: Array
 ) -> tuple[Array, Array]:
-    """Return the mean and the covariance T diag(p) Tᵀ of a Gaussian in the common coordinates."""
+    """Return mean and covariance, in the given coordinates, of a Gaussian in the common ones.
+
+    There its mean is T⁻¹ m_a plus a shift (..., d), and its covariance diagonal, (..., d).
+    """
+    # m = m_a + T shift and P = T diag(p) Tᵀ
     mean = mean_a + (transform @ shift[..., None])[..., 0]
     cov = (transform * variances[..., None, :]) @ transform.mT
     return mean, symmetrise(cov)
@@ -360,7 +377,11 @@ def _return_from(
 def _choose_weight(
     omega: float | None, size: Callable[[Array], Array], leading: tuple[int, ...]
 ) -> Array:
-    """Return a given weight, or those in [0, 1] for which a size (..., points) is smallest."""
+    """Return weights (*leading): the given one, or those in [0, 1] with the smallest result.
+
+    ``size(weights) -> sizes`` gives the result's size at weights (*leading, points). It is
+    evaluated on a grid, and then on a finer one between the neighbours of the best point.
+    """
     if omega is not None:
         return np.full(leading, omega)
     fractions = np.linspace(0.0, 1.0, _POINTS)

@@ -101,7 +101,7 @@ def condition(
     """
     missing = None if all_finite(innovation) else np.isnan(innovation)
     if missing is not None:
-        # A row of H may be missing too.
+        # The row of H may be NaN too, where the component cannot be predicted.
         H = np.where(missing[..., None], 0.0, H)
         innovation = np.where(missing, 0.0, innovation)
     cross, innovation_cov = innovation_moments(cov, H, R, missing)
@@ -135,7 +135,10 @@ def innovation_moments(
 
 
 def joseph(cov: Array, gain: Array, H: Array, R: Array) -> Array:
-    """The covariance after an update with any gain, as a sum of squares: Joseph's form."""
+    """The covariance (..., d, d) after an update with any gain K (..., d, m), in Joseph's form.
+
+    As a sum of squares it cannot become indefinite by rounding.
+    """
     # P⁺ = (I - K H) P (I - K H)ᵀ + K R Kᵀ
     reduction = identity(cov.shape[-1]) - gain @ H
     prior_part = reduction @ cov @ np.ascontiguousarray(reduction.mT)

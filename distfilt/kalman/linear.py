@@ -132,12 +132,13 @@ def kalman_filter(
     # A contiguous copy is faster in the loop.
     f_transposed = np.ascontiguousarray(f.mT)
     if _share_covariance(cov, y):
-        # One covariance for all runs, whose means are the columns of one matrix.
+        # One covariance for all R runs, whose means are the columns of one matrix: P is (1, d, d),
+        # x (1, d, R) and y (T, 1, m, R).
         p = cov[None]
         x = x.T[None]
         y = y.mT[:, None]
     else:
-        # Means and observations as columns, one for each run.
+        # A covariance and a column for each run: P is (R, d, d), x (R, d, 1) and y (T, R, m, 1).
         x = x[..., None]
         y = y[..., None]
     missing = np.asarray(np.isnan(y).any(axis=-1))
@@ -166,7 +167,7 @@ def kalman_filter(
 
 
 def _share_covariance(cov: Array, y: Array) -> bool:
-    """Whether all runs have one prior covariance and the same missing components."""
+    """Whether all runs have one prior covariance and the same missing components of y (T, R, m)."""
     # Patterns are compared with that of the first run.
     missing = np.isnan(y)
     return cov.ndim == 2 and bool((missing == missing[:, :1]).all())
@@ -175,9 +176,27 @@ def _share_covariance(cov: Array, y: Array) -> bool:
 def assimilate(
     cov: Array, innovations: Array, H: Array, R: Array, missing: Mask
 ) -> tuple[Array, Array, Array]:
-    """Increments of the mean, the analysis covariance, and the innovations' log densities.
+    """Update Gaussians that have one covariance in common by an observation each.
 
-    The k columns of the innovations (..., m, k), zero where they are missing, share a covariance.
+    Parameters
+    ----------
+    cov : ndarray, (..., d, d)
+        The forecast covariance.
+    innovations : ndarray, (..., m, k)
+        Observations minus predictions of k Gaussians, as columns; zero where they are missing.
+    H, R : ndarray, (..., m, d) and (..., m, m)
+        Observation matrix and noise covariance.
+    missing : ndarray of bool, (..., m)
+        Which components are missing, in all k columns.
+
+    Returns
+    -------
+    increments : ndarray, (..., d, k)
+        Analysis means minus forecast means.
+    cov : ndarray, (..., d, d)
+        The analysis covariance.
+    log_density : ndarray, (..., k)
+        Logarithms of the innovations' densities.
     """
     # H P and S = H P Hᵀ + R, with a one on the diagonal for missing components
     cross, innovation_cov = innovation_moments(cov, H, R, missing)
@@ -267,11 +286,12 @@ def rts_smoother(
 def flatten_runs(
     mean: Array, cov: Array, observations: Array
 ) -> tuple[tuple[int, ...], Array, Array, Array]:
-    """Broadcast the run axes, and flatten them to one axis of length R.
+    """Broadcast the run axes of three arguments, and flatten them to one axis of length R.
 
-    Returns the axes, observations (T, R, m), means (R, d) and covariances (R, d, d).
+    The axes are the leading ones of the mean (..., d) and of the covariance (..., d, d), and the
+    middle ones of the observations (T, ..., m). Returns the axes, observations (T, R, m), means
+    (R, d) and covariances (R, d, d).
     """
-    # The run axes of all three arguments broadcast.
     runs = broadcast_leading(observations.shape[1:-1], mean.shape[:-1], "mean")
     runs = broadcast_leading(runs, cov.shape[:-2], "cov")
     steps = len(observations)
@@ -290,7 +310,10 @@ def flatten_runs(
 def unflatten_runs(
     means: Array, covs: Array, log_likelihood: Array, runs: tuple[int, ...]
 ) -> FilterResult:
-    """Restore the run axes of results (T, R, ...); axes of length 1 for a shared covariance."""
+    """Restore the run axes of means (T, R, d), covariances (T, R, d, d) and densities (T, R).
+
+    If the runs share a covariance, (T, 1, d, d), its run axes have length 1.
+    """
     steps = len(means)
     # R runs have a covariance each, or share one.
     cov_runs = runs if covs.shape[1] == math.prod(runs) else (1,) * len(runs)
@@ -302,7 +325,10 @@ def unflatten_runs(
 
 
 def repeat_per_step(steps: int, **matrices: Array) -> list[Array]:
-    """Broadcast matrices that are constant or given per step to (steps, ...)."""
+    """Broadcast matrices (a, b) or (steps, a, b) to one for each step, in the order given.
+
+    Their names are those of the caller's arguments, for the error.
+    """
     repeated = []
     for name, matrix in matrices.items():
         size = matrix.shape[-2:]
@@ -316,7 +342,10 @@ def repeat_per_step(steps: int, **matrices: Array) -> list[Array]:
 
 
 def prepend_prior_time(times: Array, observations: Array, sensor: Sensor) -> Array:
-    """Validate the observations' times and shape; the T + 1 times from the prior's, which is 0."""
+    """Validate the observations' times (T,) and shape (T, ..., m) for a sensor.
+
+    Returns the T + 1 times from that of the prior, which is 0.
+    """
     steps = len(times)
     if len(observations) != steps or observations.shape[-1] != sensor.dim:
         raise ValueError(

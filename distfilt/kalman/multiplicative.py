@@ -84,7 +84,10 @@ class QuaternionChart(FrozenModel):
         return self.dim - 1
 
     def retract(self, x: Array, e: Array) -> Array:
-        """Move states (..., d) by errors (..., k)."""
+        """Move states x (..., d) by errors e (..., k): by addition, and the quaternion by rotation.
+
+        The rotation vector of the error has the place of the quaternion.
+        """
         i = self.first
         # Components before and after the quaternion are plain vectors.
         before = x[..., :i] + e[..., :i]
@@ -93,19 +96,19 @@ class QuaternionChart(FrozenModel):
         return np.concatenate([before, quaternion, after], axis=-1)
 
     def local(self, x: Array, other: Array) -> Array:
-        """Error that moves x to `other`, the inverse of `retract`."""
+        """Error (..., k) that moves x to `other`, both (..., d): the inverse of `retract`."""
         i = self.first
-        # Also of the quaternion's components, which are replaced by the angle.
         difference = other - x
         before = difference[..., :i]
-        angle = rotation_vector_between(x[..., i : i + 4], other[..., i : i + 4])
+        # The difference of the quaternions is not used: the rotation vector takes its place.
+        rotation = rotation_vector_between(x[..., i : i + 4], other[..., i : i + 4])
         after = difference[..., i + 4 :]
-        return np.concatenate([before, angle, after], axis=-1)
+        return np.concatenate([before, rotation, after], axis=-1)
 
     def tangent_basis(self, x: Array) -> Array:
         """Derivative B of `retract` with respect to the error, at zero, (..., d, k)."""
         i = self.first
-        # Identity but for the quaternion's block D(q)
+        # The identity, but for the quaternion q: its derivative in the rotation vector, (4, 3).
         basis = np.zeros((*x.shape, self.error_dim))
         basis[..., :i, :i] = np.eye(i)
         basis[..., i : i + 4, i : i + 3] = left_directions(x[..., i : i + 4])
@@ -141,11 +144,12 @@ def mekf(
 ) -> FilterResult:
     r"""Multiplicative extended Kalman filter: an extended filter on the errors of a chart.
 
-    With the tangent basis B of the chart and its pseudo-inverse, the transition of the errors is
-    :math:`\mathbf B(\mathbf x')^+\,\mathbf J\,\mathbf B(\mathbf x)`, their noise covariance
-    :math:`\mathbf B(\mathbf x')^+\mathbf Q\,\mathbf B(\mathbf x')^{+\top}`, and the matrix of a
-    sensor :math:`\mathbf H\,\mathbf B(\mathbf x)`. An analysis moves the mean by `retract`. The
-    covariances (T, ..., k, k) are those of the errors ``chart.local(means, truth)``.
+    A step leads from x to the forecast x'. With the model's Jacobian J and noise covariance Q, the
+    sensor's Jacobian H, the tangent basis B of the chart and its pseudo-inverse, the transition of
+    the errors is :math:`\mathbf B(\mathbf x')^+\,\mathbf J\,\mathbf B(\mathbf x)`, their noise
+    covariance :math:`\mathbf B(\mathbf x')^+\mathbf Q\,\mathbf B(\mathbf x')^{+\top}`, and the
+    observation matrix :math:`\mathbf H\,\mathbf B(\mathbf x')`. An analysis moves the mean by
+    `retract`. The covariances (T, ..., k, k) are those of the errors ``chart.local(means, truth)``.
 
     Parameters
     ----------
@@ -210,16 +214,20 @@ def mekf(
     covs = np.empty((len(y), *p.shape))
     log_likelihood = np.empty(y.shape[:2])
     parts = _list_parts(sensors, y)
-    # Each sensor of increments compares with the start before its first observation.
-    changes = [part for part in parts if part.sensor.uses_previous]
-    previous = [x] * len(changes)
-    p = np.tile(p, (1, 1 + len(changes), 1 + len(changes)))
+    # A sensor of increments compares the present state with the one at its last observation, and
+    # at first with the prior. The errors of those earlier states are estimated too, behind the
+    # present ones. At the start all are the same state, so all blocks of P are equal.
+    increments = [part for part in parts if part.sensor.uses_previous]
+    previous = [x] * len(increments)
+    n_blocks = 1 + len(increments)
+    p = np.tile(p, (1, n_blocks, n_blocks))
     has_unseen = False
     for n, t in enumerate(times):
         dt = t - clock[n]
         try:
             forecast, joint = _predict(x, p, chart, model, clock[n], dt)
             innovation = _find_innovation(forecast, previous, y[n], parts, sensor)
+            # Observed, but not predicted.
             has_unseen |= bool((np.isnan(innovation) & ~np.isnan(y[n])).any())
             slope = _error_jacobian(forecast, joint, previous, parts, chart)
             x, previous, p, log_likelihood[n] = _assimilate(
@@ -229,7 +237,7 @@ def mekf(
             raise np.linalg.LinAlgError(f"at t = {format_number(t)}: {error}") from None
         means[n] = x
         covs[n] = p[:, :k, :k]
-        previous, p = _renew(x, previous, p, y[n], changes)
+        previous, p = _replace_previous(x, previous, p, y[n], increments)
     if has_unseen:
         warnings.warn(
             "observations must be predicted to be used, but a sensor cannot see from a mean "
@@ -241,7 +249,7 @@ def mekf(
 
 
 class _Part(NamedTuple):
-    """A sensor, which of its numbers are meant, and where they stand among the observations."""
+    """A sensor, or some of its components: `rows` of the sensor, `columns` of all observations."""
 
     sensor: Sensor
     rows: slice
@@ -249,23 +257,25 @@ class _Part(NamedTuple):
 
 
 def _list_parts(sensors: Sequence[Sensor], y: Array) -> list[_Part]:
-    """Return the sensors with their columns; those of a stack one by one.
+    """Return the sensors with their columns of the observations; those of a stack one by one.
 
     A sensor of increments whose components are not all missing together is several parts, which
-    compare with states of different times.
+    compare with states of different times. The observations `y` (T, R, m) are those of T times and
+    R runs, with NaN where missing.
     """
     parts: list[_Part] = []
     waiting = list(sensors)
     start = 0
     while waiting:
         sensor = waiting.pop(0)
+        # The sensors of a stack are an option of its function, fixed by `partial`.
         if sensor.kind == "stack" and isinstance(sensor.h, partial):
             waiting = [*sensor.h.keywords["sensors"], *waiting]
             continue
         n = sensor.dim
         present = ~np.isnan(y[..., start : start + n])
-        is_split = (present != present[..., :1]).any() and sensor.uses_previous
-        size = 1 if is_split else n
+        differs_within = (present != present[..., :1]).any()
+        size = 1 if differs_within and sensor.uses_previous else n
         for row in range(0, n, size):
             rows = slice(row, row + size)
             columns = slice(start + row, start + row + size)
@@ -277,9 +287,10 @@ def _list_parts(sensors: Sequence[Sensor], y: Array) -> list[_Part]:
 def _predict(
     x: Array, p: Array, chart: QuaternionChart, model: Model, t: float, dt: float
 ) -> tuple[Array, Array]:
-    """Forecast means (R, d) and covariances of their errors, (R, K, K).
+    """Forecast means (R, d) and the covariances (R, K, K) of their errors and of earlier ones.
 
-    Behind the k present errors stand those of the states with which sensors of increments compare.
+    Behind the k present errors stand those of the states with which sensors of increments compare,
+    k for each: these states do not change. `t` and `dt` are start and length of the step.
     """
     k = chart.error_dim
     forecast = model.step(x, t, dt)
@@ -288,15 +299,17 @@ def _predict(
     # Transition of the errors: A = B(x')⁺ J B(x)
     basis = chart.tangent_basis(x)
     present = p[:, :k, :k]
-    # Standard deviations of the state, from those of its error
+    # Standard deviations of the state, from those of its error; they bound the steps of
+    # differences where the model has no derivative.
     std = deviations(basis @ present @ basis.mT)
-    a = projection @ model.jacobian(x, t, dt, std=std) @ basis
+    transition = projection @ model.jacobian(x, t, dt, std=std) @ basis
+    # P⁻ = A P Aᵀ + B(x')⁺ Q B(x')⁺ᵀ
     noise_cov = projection @ model.noise_at(x, t, dt) @ projection.mT
-    cov = a @ present @ a.mT + noise_cov
+    cov = transition @ present @ transition.mT + noise_cov
     if p.shape[-1] == k:
         return forecast, cov
-    # The covariance of present and earlier errors is A P.
-    cross = a @ p[:, :k, k:]
+    # Earlier errors stay, so that their covariance with the present ones is multiplied by A.
+    cross = transition @ p[:, :k, k:]
     return forecast, np.block([[cov, cross], [cross.mT, p[:, k:, k:]]])
 
 
@@ -307,12 +320,15 @@ def _find_innovation(
     parts: list[_Part],
     sensor: Sensor,
 ) -> Array:
-    """Return the observations minus their predictions, (R, m)."""
-    earlier = iter(previous)
+    """Return the observations (R, m) minus their predictions, wrapped as `sensor` wraps them.
+
+    `previous` has the states (R, d) with which the parts of increments compare, in their order.
+    """
+    next_previous = iter(previous)
     predicted = []
     for part in parts:
-        before = next(earlier) if part.sensor.uses_previous else None
-        values = part.sensor.predict(forecast, before)
+        earlier_state = next(next_previous) if part.sensor.uses_previous else None
+        values = part.sensor.predict(forecast, earlier_state)
         predicted.append(values[..., part.rows])
     return sensor.residual(y, np.concatenate(predicted, axis=-1))
 
@@ -326,7 +342,11 @@ def _assimilate(
     chart: QuaternionChart,
     sensor: Sensor,
 ) -> tuple[Array, list[Array], Array, Array]:
-    """Analysis means (R, d), earlier means, covariances, and log densities (R,)."""
+    """Return analysis means (R, d), earlier means, covariances (R, K, K) and log densities (R,).
+
+    `innovation` (R, m) is NaN where a component is missing; `slope` (R, m, K) is its derivative in
+    the present and the earlier errors, of which `cov` (R, K, K) is the covariance.
+    """
     missing = np.isnan(innovation)
     # Missing components have no innovation and no row in H.
     innovation = np.where(missing, 0.0, innovation)
@@ -337,35 +357,39 @@ def _assimilate(
     k = chart.error_dim
     x = chart.retract(forecast, error[:, :k, 0])
     _check_finite(x)
-    earlier = []
+    smoothed = []
     for j, mean in enumerate(previous, start=1):
-        # The earlier states are conditioned too.
-        earlier.append(chart.retract(mean, error[:, j * k : (j + 1) * k, 0]))
-    return x, earlier, cov, log_density[:, 0]
+        # The observation tells of the earlier states too: their errors are block j.
+        smoothed.append(chart.retract(mean, error[:, j * k : (j + 1) * k, 0]))
+    return x, smoothed, cov, log_density[:, 0]
 
 
-def _renew(
-    x: Array, previous: list[Array], p: Array, y: Array, changes: list[_Part]
+def _replace_previous(
+    x: Array, previous: list[Array], p: Array, y: Array, increments: list[_Part]
 ) -> tuple[list[Array], Array]:
-    """Let sensors of increments that have observed compare with the present state from now on."""
-    if not changes:
+    """Let sensors of increments that have observed compare with the present state from now on.
+
+    Returns the states (R, d) with which each compares, and the covariance (R, K, K) of the present
+    and those states' errors: where a state is replaced, its rows and columns become the present's.
+    """
+    if not increments:
         return previous, p
-    k = p.shape[-1] // (1 + len(changes))
+    k = p.shape[-1] // (1 + len(increments))
     n_runs = len(x)
-    # For each run, which errors take the places of the earlier ones.
-    index = np.tile(np.arange(p.shape[-1]), (n_runs, 1))
-    renewed = []
-    for j, part in enumerate(changes, start=1):
-        present = ~np.isnan(y[:, part.columns])
-        # All components or none.
-        is_observed = present[:, 0]
-        index[is_observed, j * k : (j + 1) * k] = np.arange(k)
-        renewed.append(np.where(is_observed[:, None], x, previous[j - 1]))
-    rows = np.arange(n_runs)[:, None, None]
-    return renewed, p[rows, index[:, :, None], index[:, None, :]]
+    # For each run, the row of P that each row of the new P is a copy of.
+    source = np.tile(np.arange(p.shape[-1]), (n_runs, 1))
+    replaced = []
+    for j, part in enumerate(increments, start=1):
+        # The components of a part are all present or all missing, so the first one tells.
+        is_observed = ~np.isnan(y[:, part.columns][:, 0])
+        source[is_observed, j * k : (j + 1) * k] = np.arange(k)
+        replaced.append(np.where(is_observed[:, None], x, previous[j - 1]))
+    run = np.arange(n_runs)[:, None, None]
+    return replaced, p[run, source[:, :, None], source[:, None, :]]
 
 
 def _check_finite(x: Array) -> None:
+    """Raise an error that names the first run whose state (R, d) is not finite."""
     infinite = ~np.isfinite(x).all(axis=-1)
     if infinite.any():
         raise np.linalg.LinAlgError(f"run {infinite.argmax()} is no longer finite")
@@ -378,22 +402,27 @@ def _error_jacobian(
     parts: list[_Part],
     chart: QuaternionChart,
 ) -> Array:
-    """Derivative of the observations in the present and the earlier errors, (R, m, K)."""
+    """Derivative of the observations in the present and the earlier errors, (R, m, K).
+
+    By the chain rule it is the sensor's Jacobian times the tangent basis, H B(x).
+    """
     basis = chart.tangent_basis(x)
-    # The present errors come first in a joint covariance.
+    # The present errors come first in the joint covariance.
     k = chart.error_dim
     std = deviations(basis @ cov[..., :k, :k] @ basis.mT)
-    slope = np.zeros((len(x), parts[-1].columns.stop, cov.shape[-1]))
+    n_observed = parts[-1].columns.stop
+    slope = np.zeros((len(x), n_observed, cov.shape[-1]))
+    # Number of parts of increments so far; the errors of their earlier states are blocks 1, 2, ...
     j = 0
     for sensor, rows, columns in parts:
-        before = previous[j] if sensor.uses_previous else None
-        present = sensor.jacobian(x, before, std=std) @ basis
+        earlier_state = previous[j] if sensor.uses_previous else None
+        present = sensor.jacobian(x, earlier_state, std=std) @ basis
         slope[:, columns, :k] = present[:, rows]
-        if before is None:
+        if earlier_state is None:
             continue
         j += 1
         block = slice(j * k, (j + 1) * k)
-        earlier = _earlier_jacobian(sensor, x, before, chart)
+        earlier = _earlier_jacobian(sensor, x, earlier_state, chart)
         slope[:, columns, block] = earlier[:, rows]
     return slope
 
@@ -401,9 +430,13 @@ def _error_jacobian(
 def _earlier_jacobian(
     sensor: Sensor, x: Array, previous: Array, chart: QuaternionChart
 ) -> Array:
-    """Derivative of a sensor of increments in the errors of the earlier states, (R, m, k)."""
+    """Derivative of a sensor of increments in the errors of the earlier states, (R, m, k).
+
+    A sensor gives only the derivative in the present state, so that differences are taken.
+    """
 
     def predict(varied: Array) -> Array:
+        # Differences are taken at varied earlier states (R, n, d), with the same present state.
         return sensor.predict(np.broadcast_to(x[:, None], varied.shape), varied)
 
     slope = central_difference(predict, previous, difference=sensor.residual)

@@ -50,13 +50,17 @@ StateCov = Annotated[PositiveDefinite, "... model.dim model.dim"]
 
 
 class _SigmaPoints(Protocol):
-    """What draws the points of an unscented filter of filterpy."""
+    """The part of filterpy's unscented filter that computes its points."""
 
     def sigma_points(self, x: Array, P: Array) -> Array: ...
 
 
 class _Filterpy(Protocol):
-    """What is used of the filters of filterpy, the points of the unscented one alone."""
+    """The attributes and methods of filterpy's filters that are used here.
+
+    `sigmas_f`, `Wm` (points after the forecast, and their weights) and `points_fn` belong to the
+    unscented filter only.
+    """
 
     x: Array
     P: Array
@@ -71,7 +75,9 @@ class _Filterpy(Protocol):
 
 
 Step = Callable[[_Filterpy, int, Array, Mask], None]
-"""``step(kf, k, observation, present)`` moves a filter of filterpy to step k."""
+"""``step(kf, k, observation, present)``: forecast a filter of filterpy to time k and update it.
+
+The observation is (m,), and `present` marks those of its components that are not missing."""
 
 
 @validated
@@ -104,6 +110,7 @@ def filterpy_kf(
     m, d = h.shape[1:]
 
     def step(kf: _Filterpy, k: int, z: Array, present: Mask) -> None:
+        """Forecast to time k, and update by the components of z that are present."""
         kf.predict(F=f[k], Q=q[k])
         if present.any():
             # Rows of missing components are deleted from H and R.
@@ -151,6 +158,7 @@ def filterpy_ekf(
     sensor, clock = _stack_sensors(sensors, times, observations)
 
     def step(kf: _Filterpy, k: int, z: Array, present: Mask) -> None:
+        """Forecast to time k, and update by the components of z that are present."""
         t = float(clock[k])
         dt = float(clock[k + 1] - clock[k])
         # The linearisation is about the last analysis mean.
@@ -161,8 +169,8 @@ def filterpy_ekf(
         # filterpy predicts the mean by F; the nonlinear model is more accurate.
         kf.x = forecast
         if present.any():
-            # The observation is the residual, which the sensor wraps, and its prediction zero.
-            # Wrapped where the sensor wraps
+            # filterpy subtracts the prediction from the observation. Angles have to be wrapped, so
+            # it gets the sensor's residual for an observation, and zero for its prediction.
             residual = sensor.residual(z, sensor.predict(forecast))[present]
             h = sensor.jacobian(forecast, std=deviations(kf.P))[present]
             noise_cov = sensor.noise_cov[np.ix_(present, present)]
@@ -219,11 +227,12 @@ def filterpy_ukf(
         return kf
 
     def step(kf: _Filterpy, k: int, z: Array, present: Mask) -> None:
+        """Forecast to time k, and update by the components of z that are present."""
         t = float(clock[k])
         dt = float(clock[k + 1] - clock[k])
         kf.Q = model.noise_at(kf.x, t, dt)
-        # filterpy calls fx and hx for one sigma point after the other: both are computed here in
-        # one call, and handed out in that order.
+        # filterpy calls fx, the model, and hx, the sensor, for one sigma point after the other:
+        # both are computed here for all points in one call, and handed out in that order.
         points = kf.points_fn.sigma_points(kf.x, kf.P)
         forecasts = iter(model.step(points, t, dt))
         kf.predict(dt, fx=lambda x, dt: next(forecasts))
@@ -242,7 +251,8 @@ def _unwrap(
     """Predictions at sigma points, and the observation, such that plain differences are right.
 
     Values that wrap are unwrapped: the predictions about that of the central point, and the
-    observation about the mean prediction.
+    observation about the mean prediction. Points are (2d + 1, d), weights (2d + 1,), observations
+    (m,); the predictions are (2d + 1, m).
     """
     predicted = sensor.predict(points)
     centre = np.broadcast_to(predicted[0], predicted.shape)
@@ -271,7 +281,10 @@ def _run_filterpy(
     make: Callable[[], _Filterpy],
     step: Step,
 ) -> FilterResult:
-    """Filter every run by a filter of filterpy of its own, step after step."""
+    """Filter every run by a filter of filterpy of its own, step after step.
+
+    `make` returns a new filter, and `step` moves it by one observation time.
+    """
     # Runs one after the other: filterpy has no batches.
     runs, y, x, p = flatten_runs(mean, cov, observations)
     means = np.empty((len(y), *x.shape))

@@ -12,7 +12,7 @@ from ..validation import ArrayInput, Bounds, PositiveInt, validated
 __all__ = ["Interval", "mean_interval", "median_interval", "proportion_interval"]
 
 Values = Annotated[ArrayInput, "n"]
-# At a level near 0 quantiles lose their digits.
+# At a level near 0 both quantiles are near the median, and their difference loses its digits.
 Level = Annotated[float, Bounds(at_least=1e-9, below=1)]
 
 

@@ -159,13 +159,14 @@ def nees_band(
     # The sum of `count` values has count · dim degrees of freedom.
     tail = (1 - level) / 2
     total = count * dim
-    unit = total if normalised else count
+    divisor = total if normalised else count
     # Quantiles of chi-square with k degrees of freedom are 2 gammaincinv(k / 2, p).
-    low = 2 * float(gammaincinv(total / 2, tail)) / unit
-    high = 2 * float(gammaincinv(total / 2, 1 - tail)) / unit
+    low = 2 * float(gammaincinv(total / 2, tail)) / divisor
+    high = 2 * float(gammaincinv(total / 2, 1 - tail)) / divisor
     # At tiny levels the band lies below the mean, because the chi-square's median does.
-    expected = float(min(max(total / unit, low), high))
-    error = float(np.sqrt(2 * total)) / unit
+    expected = float(min(max(total / divisor, low), high))
+    # The variance of chi-square is twice its degrees of freedom.
+    error = float(np.sqrt(2 * total)) / divisor
     return Interval(expected, low, high, error)
 
 
@@ -216,8 +217,8 @@ def crps(
         errors = np.take_along_axis(errors, order, axis=-2)
         columns = np.broadcast_to(weights[..., None], errors.shape)
         w = np.take_along_axis(columns, order, axis=-2)
-    # ½ Σ_ij w_i w_j |e_i - e_j| = Σ_i w_i e_i (2 W_i - w_i - 1) of sorted errors, with W_i the
-    # sum of the weights up to i.
+    # The score is Σ_i w_i |e_i| - ½ Σ_ij w_i w_j |e_i - e_j|. Of sorted errors the second sum is
+    # Σ_i w_i e_i (2 W_i - w_i - 1), with W_i the sum of the weights up to i.
     coefficients = 2 * np.cumsum(w, axis=-2) - w - 1
     return np.asarray((w * (np.abs(errors) - coefficients * errors)).sum(axis=-2))
 

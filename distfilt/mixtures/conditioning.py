@@ -19,9 +19,9 @@ from .gaussian import GaussianMixture
 __all__ = ["propagate_mixture", "update_mixture", "within_gate"]
 
 _LOG_2PI = float(np.log(2 * np.pi))
-# Square of the step of the divided differences, in units of the variance.
-_STEP = 3.0
-# Components lighter than this are left out after an update.
+# Square h² of the step of the divided differences, in units of the variance.
+_SQUARED_STEP = 3.0
+# Components lighter than this are left out after an update: they hardly change mean or covariance.
 _NEGLIGIBLE = 1e-9
 
 
@@ -45,13 +45,14 @@ def propagate_mixture(
     >>> after.means, after.covs.round(6)  # E x² = 1.25, and its variance 4 m² P + 2 P²
     (array([[1.25]]), array([[[1.125]]]))
     """
-    values = np.asarray(call_user(function, _unscented_points(mixture)))
-    means, first, second = _divided_differences(values)
+    values = np.asarray(call_user(function, _place_points(mixture)))
+    means, first, second = _take_differences(values)
     is_finite = [np.isfinite(part).all() for part in (means, first, second)]
     if not all(is_finite):
         raise ValueError(
             "function must return finite values at the points, got NaN or an overflow"
         )
+    # P = C Cᵀ + Q with the columns C = [first, second].
     factors = _combine_roots(first, second, noise_factor)
     return _build_from_factors(mixture.weights, means, factors)
 
@@ -178,6 +179,11 @@ def _innovations(
 ) -> tuple[Array, Array, Array, Array]:
     """Innovations of the k observed components, and roots of their covariances.
 
+    Parameters
+    ----------
+    mixture, observed, function, noise, residual, on_branch
+        As of :func:`update_mixture`.
+
     Returns
     -------
     innovations : ndarray, (L, k)
@@ -190,29 +196,31 @@ def _innovations(
     present = np.flatnonzero(~missing)
     # A residual may need every component; those that are missing are zeros in both.
     y = np.where(missing, 0.0, observed)
-    predicted = call_user(function, _unscented_points(mixture))
+    predicted = call_user(function, _place_points(mixture))
     predicted = np.where(missing, 0.0, predicted)
     # Relative to the prediction at the mean, so that angles do not wrap between points.
     at_mean = predicted[:, 0]
     at_means = np.broadcast_to(at_mean[:, None], predicted.shape)
     compare = np.subtract if on_branch else residual
     relative = call_user(compare, predicted, at_means)[..., present]
-    mean, first, second = _divided_differences(relative)
+    mean, first, second = _take_differences(relative)
     difference = call_user(residual, np.broadcast_to(y, at_mean.shape), at_mean)
     innovations = difference[..., present] - mean
     return innovations, first, second, cholesky(noise[np.ix_(present, present)])
 
 
-def _unscented_points(mixture: GaussianMixture) -> Array:
+def _place_points(mixture: GaussianMixture) -> Array:
     """Points (L, 2d + 1, d) at distance √3 standard deviations from the means."""
-    kappa = _STEP - mixture.dim
+    # √(d + κ) is the distance.
+    kappa = _SQUARED_STEP - mixture.dim
     return unscented_points(mixture.means, mixture.factors, kappa=kappa)[0]
 
 
-def _divided_differences(values: Array) -> tuple[Array, Array, Array]:
-    """Mean (..., m) of a function's values at points, and its first and second differences.
+def _take_differences(values: Array) -> tuple[Array, Array, Array]:
+    """Mean (..., m) of a function's values (..., 2d + 1, m), and first and second differences.
 
-    The differences (..., m, d) are columns of a root of the values' covariance.
+    The values are those at :func:`_place_points`. The differences (..., m, d) are columns of a
+    root of the values' covariance.
     """
     d = values.shape[-2] // 2
     centre = values[..., :1, :]
@@ -220,15 +228,15 @@ def _divided_differences(values: Array) -> tuple[Array, Array, Array]:
     minus = values[..., d + 1 :, :]
     # With the step h² = 3: mean = f₀ + Σ (f₊ + f₋ - 2 f₀) / (2 h²)
     even = plus + minus - 2 * centre
-    mean = centre[..., 0, :] + even.sum(axis=-2) / (2 * _STEP)
+    mean = centre[..., 0, :] + even.sum(axis=-2) / (2 * _SQUARED_STEP)
     # first = (f₊ - f₋) / (2 h) and second = (f₊ + f₋ - 2 f₀) √(h² - 1) / (2 h²)
-    first = (plus - minus).mT / (2 * np.sqrt(_STEP))
-    second = even.mT * np.sqrt(_STEP - 1) / (2 * _STEP)
+    first = (plus - minus).mT / (2 * np.sqrt(_SQUARED_STEP))
+    second = even.mT * np.sqrt(_SQUARED_STEP - 1) / (2 * _SQUARED_STEP)
     return mean, first, second
 
 
 def _combine_roots(first: Array, second: Array, noise: Array) -> Array:
-    """Return the lower triangular L with L Lᵀ = A Aᵀ for A = [first, second, noise]."""
+    """Return the lower triangular L (..., m, m) with L Lᵀ = A Aᵀ, A = [first, second, noise]."""
     noise = np.broadcast_to(noise, first.shape[:-2] + noise.shape[-2:])
     return lower_root(np.concatenate([first, second, noise], axis=-1))
 
@@ -236,6 +244,6 @@ def _combine_roots(first: Array, second: Array, noise: Array) -> Array:
 def _build_from_factors(
     weights: Array, means: Array, factors: Array
 ) -> GaussianMixture:
-    """Build a mixture that keeps the roots of its covariances in its cache."""
+    """Build a mixture from Cholesky factors (L, d, d), which it keeps in its cache."""
     covs = factors @ factors.mT
     return GaussianMixture.construct(weights, means, covs, factors=factors)

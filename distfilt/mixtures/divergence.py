@@ -27,7 +27,7 @@ AtLeastTwo = Annotated[int, Bounds(at_least=2)]
 
 @dataclass(frozen=True)
 class Divergence(FrozenModel):
-    """An estimate of Jeffreys' divergence (44) with its standard error.
+    """An estimate of Jeffreys' divergence, (44) of Semeraro et al., with its standard error.
 
     Parameters
     ----------
@@ -109,14 +109,15 @@ def jeffreys_of_many(
         masses = factors * masses + densities.sum(axis=1)
         integrals = factors[:, None] * integrals + densities @ (logs[0] - logs).T
         scales = new_scales
-    # d(p, q) = ½ (E_p[log p - log q] - E_q[log p - log q])
+    # d(p, q) = ½ (E_p[log p - log q] - E_q[log p - log q]). Entry (f, q) is the expectation under
+    # f; density 0 is p.
     expectations = integrals / masses[:, None]
     divergences = 0.5 * (expectations[0, 1:] - np.diagonal(expectations)[1:])
     return [Divergence(float(d), 0.0) for d in divergences]
 
 
 def _evaluate_all(functions: Sequence[Callable[[Array], Array]], x: Array) -> Array:
-    """Evaluate logarithms of densities at points (n, d), one row each."""
+    """Evaluate logarithms of densities at points (n, d): a row (n,) for each function."""
     rows = []
     for function in functions:
         logs = call_user(function, x)
@@ -125,7 +126,7 @@ def _evaluate_all(functions: Sequence[Callable[[Array], Array]], x: Array) -> Ar
 
 
 def _tensor_grid(low: Array, high: Array, nodes: int) -> tuple[Array, Array]:
-    """Points (nodes^d, d) of the trapezoid rule on a box, and their weights."""
+    """Points (nodes^d, d) of the trapezoid rule on a box from `low` to `high` (d,), and weights."""
     d = low.size
     index = np.indices((nodes,) * d).reshape(d, nodes**d).T
     step = (high - low) / (nodes - 1)
@@ -189,6 +190,6 @@ def jeffreys_by_sampling(
 
 
 def _importance_weights(log_ratios: Array) -> Array:
-    """Weights with mean one, from logarithms of density over proposal."""
+    """Weights (n,) with mean one, from logarithms of density over proposal at n points."""
     weights = np.exp(log_ratios - log_ratios.max())
     return np.asarray(weights / weights.mean())

@@ -183,7 +183,7 @@ def average_mixtures(
 def align_mixture(
     mixture: GaussianMixture, reference: Array, periods: Periods
 ) -> GaussianMixture:
-    """Bring the means of a mixture's components onto the branch of a reference (d,)."""
+    """Bring the angles of a mixture's means onto the branch of a reference (d,): within a turn."""
     means = align(mixture.means, reference, periods)
     if means is mixture.means:
         return mixture
@@ -245,7 +245,7 @@ def target_fusion(
                 mean = fused[agent].mean[:target_dim]
                 received = [align_mixture(m, mean, periods) for m in received]
                 fused[agent] = call_user(fuse, fused[agent], received)
-            # A covariance without a Cholesky factor is an error of this agent.
+            # The factors are computed here, so that an error names this agent.
             fused[agent].factors  # noqa: B018
         except np.linalg.LinAlgError as error:
             raise np.linalg.LinAlgError(f"agent {agent}: {error}") from error

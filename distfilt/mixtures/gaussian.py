@@ -183,14 +183,18 @@ class GaussianMixture(FrozenModel):
     def _evaluate(
         self, x: Array, shape: tuple[int, ...], function: Callable[[Array], Array]
     ) -> Array:
-        """Apply a function to the components' log densities (n, L), in blocks of n points."""
+        """Apply a function to the components' log densities at points x (..., d), (..., *shape).
+
+        It is called with blocks of n points, (n, L), and returns (n, *shape).
+        """
         points = x.reshape(-1, self.dim)
         centre, whitening, white_means = self._whitening
         result = np.empty((len(points), *shape))
         block = max(1, _BLOCK_SIZE // self.means.size)
         for start in range(0, len(points), block):
             rows = slice(start, start + block)
-            # z = L_l⁻¹ (x - m_l) for each component l, and log N_l = log peak_l - ½ zᵀz.
+            # z = C_l⁻¹ (x - c) - C_l⁻¹ (m_l - c) for each component l, with the factors C_l and
+            # the centre c: one product for all components. Then log N_l = log peak_l - ½ zᵀz.
             white = (points[rows] - centre) @ whitening
             z = white.reshape(-1, *white_means.shape) - white_means
             squared_lengths = np.einsum("nld,nld->nl", z, z)
@@ -199,9 +203,11 @@ class GaussianMixture(FrozenModel):
 
     @cached_property
     def _whitening(self) -> tuple[Array, Array, Array]:
-        """The mean (d,), columns (d, L d) that whiten a point, and the whitened means (L, d).
+        """The mixture's mean c (d,), and the matrices and means that whiten points.
 
-        Both are relative to the mixture's mean: far from the origin differences would cancel.
+        With the Cholesky factors C_l of the L components these are C_l⁻ᵀ side by side, (d, L d),
+        and C_l⁻¹ (m_l - c), (L, d). Points and means are relative to c: far from the origin their
+        differences would lose digits.
         """
         centre = self.weights @ self.means
         identity = np.broadcast_to(np.eye(self.dim), self.covs.shape)
@@ -307,7 +313,7 @@ class GaussianMixture(FrozenModel):
 
 
 def _describe_collapse(covs: Array) -> str:
-    """Name the component whose covariance has no square root, and the usual cause."""
+    """Name the component whose covariance (L, d, d) has no Cholesky factor, and the usual cause."""
     eigenvalues = np.linalg.eigvalsh(to_unit_variances(covs)[0])
     worst = int(eigenvalues[:, 0].argmin())
     return (
@@ -327,9 +333,9 @@ def inverse(factors: Array) -> Array:
 
 
 def regression(mixture: GaussianMixture, n: int) -> tuple[Array, Array]:
-    """Return each component's gain of e on t, and its covariance of e given t.
+    """Return each component's gain of e on t, (L, d - n, n), and covariance of e given t.
 
-    The state is [t; e], and t its first n components.
+    The state is [t; e], and t its first n components; the covariances are (L, d - n, d - n).
     """
     target = mixture.covs[:, :n, :n]
     cross = mixture.covs[:, :n, n:]
@@ -339,7 +345,10 @@ def regression(mixture: GaussianMixture, n: int) -> tuple[Array, Array]:
 
 
 def assemble_joint(target: Array, gain: Array, conditional: Array) -> Array:
-    """Assemble covariances of [t; e] from P_tt, the gain G of e on t, and P_e|t."""
+    """Assemble covariances of [t; e], (..., d, d), from P_tt, the gain G of e on t, and P_e|t.
+
+    :func:`regression` gives G and P_e|t of a prior, of which only P_tt has changed.
+    """
     # P_et = G P_tt and P_ee = P_e|t + G P_tt Gᵀ
     ego = symmetrise(conditional + gain @ target @ gain.mT)
     n = target.shape[-1]

@@ -35,7 +35,10 @@ def compile_function(function: F) -> F:
 def loop_costs(
     w: Array, m: Array, p: Array, log_dets: Array, i: int, others: Indices
 ) -> Array:
-    """As :func:`pair_costs`, for numba: form and factor each merged covariance in one pass."""
+    """As :func:`pair_costs`, for numba: form and factor each merged covariance in one pass.
+
+    With loops over its entries, which numba compiles, no intermediate arrays are made.
+    """
     d = m.shape[1]
     lower = np.empty((d, d))
     costs = np.zeros(others.size)
@@ -59,16 +62,18 @@ def loop_costs(
             s = a * first[r, r] + b * second[r, r] + v[r] ** 2
             for e in range(r):
                 s -= lower[r, e] ** 2
-            # The diagonal holds reciprocals, so that the columns need no division.
+            # The diagonal holds reciprocals, so that the columns need no division. The squares of
+            # the factor's diagonal multiply to the determinant.
             lower[r, r] = 1.0 / np.sqrt(s)
             log_det += np.log(s)
+        # 2 B_ij = (w_i + w_j) log|P_ij| - w_i log|P_i| - w_j log|P_j|
         separate = total * log_det - w[i] * log_dets[i]
         costs[k] = 0.5 * (separate - w[j] * log_dets[j])
     return costs
 
 
 def merge_pairs(w: Array, m: Array, p: Array, n_components: int) -> Mask:
-    """Merge the cheapest pair, in place, until `n_components` are left; mark those that are.
+    """Merge the cheapest pair, in place, until `n_components` are left.
 
     Parameters
     ----------
@@ -80,12 +85,13 @@ def merge_pairs(w: Array, m: Array, p: Array, n_components: int) -> Mask:
     Returns
     -------
     ndarray of bool, (L,)
+        Which components are left: a merger has the place of the first of its pair.
     """
     n = w.size
     index = np.arange(n)
     remaining = np.full(n, True)
     log_dets = np.array([np.linalg.slogdet(p[i])[1] for i in range(n)])
-    # Costs of the pairs i < j, and each row's cheapest pair.
+    # Costs of the pairs i < j, infinite elsewhere; of each row the least, and its column.
     table = np.full((n, n), np.inf)
     best = np.full(n, np.inf)
     nearest = np.zeros(n, np.int64)

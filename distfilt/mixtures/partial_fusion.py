@@ -6,7 +6,8 @@ ego state e comes last and differs from agent to agent. The fused density is
 .. math:: p_f(\mathbf x)\propto p(\mathbf x)\,p(\mathbf t)^{\omega-1}
     \prod_b p_b(\mathbf t)^{\omega_b},\qquad \omega+\sum_b\omega_b=1,
 
-equations (14)-(15) of Semeraro, LeGrand and Kulik for one other agent.
+equations (14)-(15) of Semeraro, LeGrand and Kulik for one other agent. Equation numbers in this
+module are those of that paper, Semeraro et al. for short.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ Terms = Literal["matched", "all"]
 Rule = Literal["C1", "C2", "C3", "points"]
 Condition = Annotated[float, Bounds(above=1, at_most=1e150)]
 
-# Relative density below which the rows of "points" stop gaining weight.
+# Density, relative to the largest, below which the rows of "points" stop gaining weight: farther
+# out than at a thousandth (3.7 deviations of a Gaussian) no accuracy is wanted.
 _DENSITY_FLOOR = 1e-3
 # Smallest pivots of a term's information matrix, relative to its diagonal entry: where prior and
 # divided component are the same a Cholesky factor exists, else a small pivot may be rounding.
@@ -106,7 +108,7 @@ class PartialFusion(FrozenModel):
 
     @cached_property
     def exponents(self) -> Array:
-        """Exponents of the prior's and of the others' target marginals; their sum is 1."""
+        """Exponents of the prior's and of the K others' target marginals, (1 + K,), with sum 1."""
         n_others = len(self.others)
         if isinstance(self.omega, np.ndarray):
             return self.omega
@@ -127,7 +129,11 @@ class PartialFusion(FrozenModel):
         return self.prior.marginal(range(self.target_dim))
 
     def _add_log_update(self, logs: Array, t: Array, name: str) -> Array:
-        """Add the logarithm of the update factor g(t) of (15) to log densities."""
+        """Add the logarithm of the update factor g(t), (15) of Semeraro et al., to `logs` (...).
+
+        It is a power of all beliefs about the target t (..., n) by which the prior is multiplied.
+        `name` is the argument from which the targets come, for the error.
+        """
         # log g(t) = (ω - 1) log p(t) + Σ ω_b log p_b(t)
         exponents = self.exponents
         with np.errstate(invalid="ignore"):
@@ -145,7 +151,7 @@ class PartialFusion(FrozenModel):
 
     @validated
     def log_value(self, x: Annotated[ArrayInput, "... self.prior.dim"]) -> Array:
-        """Logarithm of the fused density (14), not normalised, (...).
+        """Logarithm of the fused density, (14) of Semeraro et al., not normalised, (...).
 
         Parameters
         ----------
@@ -156,7 +162,10 @@ class PartialFusion(FrozenModel):
 
     @validated
     def log_target(self, t: Annotated[ArrayInput, "... self.target_dim"]) -> Array:
-        """Logarithm of the fused target marginal, not normalised; it needs no ego state."""
+        """Logarithm of the fused target marginal (...) at targets (..., n), not normalised.
+
+        It needs no ego state.
+        """
         return self._add_log_update(self.target.log_density(t), t, "t")
 
     @validated
@@ -167,18 +176,21 @@ class PartialFusion(FrozenModel):
         marginal: GaussianMixture | None = None,
         received: Sequence[GaussianMixture] | None = None,
     ) -> ComponentShapes:
-        """Means and covariances of the fused components, (22)-(28), without weights.
+        """Means and covariances of the fused components, without weights.
 
-        By conditioning in the frame that whitens the prior component, which inverts nothing
+        They are those of (22)-(28) of Semeraro et al. As a power of a mixture is no mixture, a
+        product of powers of components stands for that of the mixtures: a component of the prior,
+        one of its target marginal, by which it is divided, and one of each received belief. Each is
+        found by conditioning in the frame that whitens the prior component, which inverts nothing
         indefinite.
 
         Parameters
         ----------
         terms : {"matched", "all"}
-            Terms in which prior component and divided component are the same, L L' of them, all
-            positive definite (in floating point while the received beliefs are less than a million
-            times as sharp); or all L² L', of which some are not. Those are left out, and `dropped`
-            counts them.
+            Terms in which prior component and divided component are the same: L L' of them, for L
+            in the prior and L' choices of received components, all positive definite (in floating
+            point while the received beliefs are less than a million times as sharp); or all L² L',
+            of which some are not. Those are left out, and `dropped` counts them.
         marginal : GaussianMixture, optional
             Divide by this (a reduced marginal) in place of the prior's target marginal; with
             ``terms="all"``.
@@ -201,6 +213,7 @@ class PartialFusion(FrozenModel):
             raise ValueError(
                 f"received must have mixtures of dimensions {expected}, got {dims}"
             )
+        # Pairs of a prior component and a component that it is divided by: the same, or all pairs.
         index = np.arange(self.prior.n_components)
         if terms == "matched":
             pairs = (index, index)
@@ -224,7 +237,8 @@ class PartialFusion(FrozenModel):
         ----------
         shapes : ComponentShapes
         rule : {"C1", "C2", "C3", "points"}
-            (30), (31), (32)-(34), or C3 with the components' sigma points as further points.
+            (30), (31) or (32)-(34) of Semeraro et al., or C3 with the components' sigma points as
+            further points.
         at_most : int
             For "C3" and "points": how many components may take part, the largest by C2.
 
@@ -244,6 +258,7 @@ class PartialFusion(FrozenModel):
         if rule == "C2":
             return _weight_by_values(mixture, logs)
         if shapes.n_components > at_most:
+            # C2 weights a component by its value over its peak.
             order = np.argsort(mixture.log_peaks - logs, kind="stable")
             largest = np.isin(np.arange(shapes.n_components), order[:at_most])
             shapes = shapes.select(largest)
@@ -254,7 +269,7 @@ class PartialFusion(FrozenModel):
             return _weight_by_values(mixture, np.log(coefficients))
 
     def _log_values_by_source(self, shapes: ComponentShapes) -> Array:
-        """Log of the fused density at the means of components (`shapes`) that have no weights yet.
+        """Log of the fused density at the components' means, (S,), for C1, (30) of Semeraro et al.
 
         Of the prior's components only the source of each counts, not the sum over all of them.
         """
@@ -265,21 +280,24 @@ class PartialFusion(FrozenModel):
         white = np.linalg.solve(prior.factors[source], differences[..., None])[..., 0]
         log_peaks = (prior.log_weights + prior.log_peaks)[source]
         logs = log_peaks - 0.5 * (white**2).sum(axis=-1)
-        # Times the update factor g(t) of (15), a function of the target t alone.
+        # Times the update factor g(t), a function of the target t alone.
         return self._add_log_update(logs, shapes.means[:, : self.target_dim], "shapes")
 
     def _collocate(
         self, mixture: GaussianMixture, logs: Array, *, with_points: bool
     ) -> Array:
-        """Return nonnegative coefficients of the components that fit the density at points, (33).
+        """Return nonnegative coefficients of the components that fit the density at points.
 
-        The points are the components' means, or all their sigma points.
+        They are the least-squares solution of (32)-(34) of Semeraro et al. The points are the
+        components' means, where `logs` (S,) is the logarithm of the density, or all their sigma
+        points. A coefficient (S,) belongs to a component with the peak 1.
         """
         points = mixture.means
         if with_points:
             sigma_points = unscented_points(mixture.means, mixture.factors)[0]
             points = sigma_points.reshape(-1, mixture.dim)
             logs = self.log_value(points)
+        # Entry (i, s) is component s at point i, relative to its peak.
         log_matrix = mixture.component_log_densities(points) - mixture.log_peaks
         matrix = np.exp(log_matrix)
         values = np.exp(logs - logs.max())
@@ -292,9 +310,10 @@ class PartialFusion(FrozenModel):
 
 
 def _weight_by_values(mixture: GaussianMixture, logs: Array) -> GaussianMixture:
-    """Weight components by the logarithms of their values at the means, (18).
+    """Weight components so that each has a given value at its mean, (18) of Semeraro et al.
 
-    Components whose weight vanishes are left out.
+    `logs` (S,) are the logarithms of the values, up to a constant. Components whose weight vanishes
+    are left out.
     """
     # w_s ∝ value_s / peak_s
     log_weights = logs - mixture.log_peaks
@@ -314,23 +333,24 @@ def _weight_by_values(mixture: GaussianMixture, logs: Array) -> GaussianMixture:
 def _multiply_received(
     received: Sequence[GaussianMixture], exponents: Array, centres: Array
 ) -> tuple[Array, Array]:
-    """Information (Q, T, n, n) and vectors (Q, T, n) of the product of the received powers.
+    """Return the product of the received beliefs' powers: a Gaussian for each choice of components.
 
-    One term for each choice of a component from each belief, with vectors relative to centres
-    (Q, n).
+    With one component r from each belief b the product of the powers of exponents ω_b has the
+    information Λ = Σ ω_b P_r⁻¹ and the vector η = Σ ω_b P_r⁻¹ (m_r - c) relative to a centre c.
+    Returns Λ (Q, T, n, n) and η (Q, T, n) of all T choices, for each of Q centres (Q, n).
     """
-    q, n = centres.shape
-    information = np.zeros((q, 1, n, n))
-    vectors = np.zeros((q, 1, n))
+    n_centres, n = centres.shape
+    information = np.zeros((n_centres, 1, n, n))
+    vectors = np.zeros((n_centres, 1, n))
     for exponent, other in zip(exponents, received, strict=True):
-        # Λ = ω P_r⁻¹ and η = Λ (m_r - c), added to every earlier term.
+        # Each component of this belief is added to every choice so far.
         precisions = exponent * inverse(other.factors)
         differences = other.means - centres[:, None]
         added = np.einsum("rij,srj->sri", precisions, differences)
         information = information[:, :, None] + precisions
-        information = information.reshape(q, -1, n, n)
+        information = information.reshape(n_centres, -1, n, n)
         vectors = vectors[:, :, None] + added[:, None]
-        vectors = vectors.reshape(q, -1, n)
+        vectors = vectors.reshape(n_centres, -1, n)
     return information, vectors
 
 
@@ -341,11 +361,12 @@ def _fuse_components(
     exponents: Array,
     pairs: tuple[Indices, Indices],
 ) -> ComponentShapes:
-    """Update prior components q, divided by components p, with all products of received ones.
+    r"""Update prior components q, divided by components p, with all products of received ones.
 
     The target part is updated with the information Λ and the vector η of
-    :math:`p_p^{\\omega-1}\\prod_b p_b^{\\omega_b}` in the frame that whitens it; e follows by
-    regression.
+    :math:`p_p^{\omega-1}\prod_b p_b^{\omega_b}` in the frame that whitens it; e follows by
+    regression. `pairs` are the indices q and p, (Q,) each; with T products the result has up to
+    Q T components, those whose covariance is positive definite.
     """
     n = divided.dim
     q, p = pairs
@@ -365,6 +386,7 @@ def _fuse_components(
     is_matched = (q == p) & (len(divided.means) == prior.n_components)
     smallest_pivot = np.where(is_matched, _MATCHED_PIVOT, _UNMATCHED_PIVOT)
     lower, is_definite = _factor_definite(relative, smallest_pivot[:, None])
+    # I + Sᵀ Λ S = C Cᵀ, so that P_tt = (C⁻¹ Sᵀ)ᵀ (C⁻¹ Sᵀ).
     half = np.linalg.solve(lower, np.broadcast_to(root.mT, lower.shape))
     target = half.mT @ half
 
@@ -385,7 +407,10 @@ def _fuse_components(
 
 
 def _factor_definite(matrices: Array, smallest_pivot: Array) -> tuple[Array, Mask]:
-    """Cholesky factors of a stack, and which of them exist; the identity where none does."""
+    """Cholesky factors of matrices (..., d, d), and which of them exist (...).
+
+    Where none does, the identity stands. `smallest_pivot` (...) is relative to the diagonal entry.
+    """
     d = matrices.shape[-1]
     lower = np.zeros_like(matrices)
     is_definite = np.ones(matrices.shape[:-2], dtype=bool)
@@ -411,12 +436,14 @@ def tikhonov(
     *,
     condition: Condition = 1e10,
 ) -> float:
-    r"""Return the smallest factor that brings a matrix's condition number to `condition`, (66).
+    r"""Return the smallest α with which rows α I below a matrix give a condition number.
+
+    That number is κ, `condition`, if by (66) of Semeraro et al.
 
     .. math:: \alpha^2=\frac{\sigma_1^2-\kappa^2\sigma_n^2}{\kappa^2-1}
 
-    and 0 where the matrix is well conditioned already. The printed (66) has an index i where the
-    largest singular value is meant.
+    with the largest and the smallest singular value of the matrix; α is 0 if the matrix is well
+    conditioned already. The printed (66) has an index i where the largest is meant.
 
     Parameters
     ----------
@@ -444,7 +471,10 @@ def nonnegative_least_squares(
     *,
     condition: Condition = 1e10,
 ) -> Array:
-    """Nonnegative weights that solve ``matrix @ w = right`` best, regularised by (60) and (66).
+    r"""Nonnegative weights that solve ``matrix @ w = right`` best, regularised.
+
+    They minimise :math:`|\mathbf M\mathbf w-\mathbf r|^2+\alpha^2|\mathbf w|^2`, (60) of Semeraro
+    et al., with the α of :func:`tikhonov`.
 
     Parameters
     ----------
@@ -485,7 +515,8 @@ def nonnegative_least_squares(
             f"nonnegative least squares: {error} ({n_unknowns} unknowns)"
         ) from None
     weights = np.asarray(solution, dtype=np.float64)
-    # Karush-Kuhn-Tucker: the gradient is nonnegative, and zero where a weight is positive.
+    # Karush-Kuhn-Tucker: the gradient is nonnegative, and zero where a weight is positive; up to
+    # a millionth of its largest possible size, that at w = 0.
     gradient = matrix.T @ (matrix @ weights - right)
     limit = 1e-6 * singular_values[0] * np.linalg.norm(right)
     largest_slope = gradient[weights > 0].max(initial=0.0)

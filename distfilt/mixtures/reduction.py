@@ -32,9 +32,11 @@ __all__ = [
     "runnalls",
 ]
 
-# Divergence in nats up to which a component counts as near another's, whatever its weight.
+# Divergence in nats up to which a component counts as near another's, whatever its weight: that of
+# two equal Gaussians one standard deviation apart.
 _NEAR = 0.5
-# Lower bound of the smallest relevance, in nats.
+# Lower bound of the smallest relevance, in nats: components that are nearer to each other than
+# about a hundredth of a standard deviation are the same.
 _RELEVANCE_FLOOR = 1e-4
 
 
@@ -174,7 +176,9 @@ def runnalls(
 
 @validated
 def merge_costs(mixture: GaussianMixture) -> Array:
-    """Runnalls' bound for each pair of components, (L, L); zero on the diagonal.
+    """Runnalls' bound B_ij, as in :func:`runnalls`, for each pair of components, (L, L), in nats.
+
+    It is zero on the diagonal.
 
     Examples
     --------
@@ -192,8 +196,9 @@ def merge_costs(mixture: GaussianMixture) -> Array:
 
 @validated
 def cross_relevance(mixture: GaussianMixture, other: GaussianMixture) -> Array:
-    r"""The matrix (38)-(39): :math:`w_q D_{KL}(\mathcal N_q\|\mathcal N_r)`, (L, L').
+    r"""The matrix of relevances :math:`w_q D_{KL}(\mathcal N_q\|\mathcal N_r)`, (L, L').
 
+    Equations (38)-(39) of Semeraro et al., for components q of one mixture and r of another.
     Divergences that rounding makes negative are zero.
 
     Parameters
@@ -217,9 +222,10 @@ def merge_irrelevant(
     *,
     threshold: Annotated[float, Bounds(above=1)],
 ) -> GaussianMixture:
-    r"""Merge into one the components that overlap with none of another's: the KLD rule (40)-(41).
+    r"""Merge into one the components that overlap with none of another's: the KLD rule.
 
-    With :math:`\delta_q=\min_r w_qD_{KL}(\mathcal N_q\|\mathcal N_r)` the components with
+    By (40)-(41) of Semeraro et al., with
+    :math:`\delta_q=\min_r w_qD_{KL}(\mathcal N_q\|\mathcal N_r)`, the components with
     :math:`\delta_q>\epsilon\,\delta_{\min}` are merged. As printed, a component that both agents
     share makes :math:`\delta_{\min}` zero, or negative by rounding, and the mixture collapses.
     Three guards: :math:`\delta_{\min}` is at least 1e-4 nats; a component is only merged if its
@@ -248,15 +254,16 @@ def merge_irrelevant(
     3
     """
     nearest = gaussian_divergences(mixture, other).min(axis=1)
-    # δ_q; a component without weight is the least relevant one.
+    # δ_q; a component without weight must not set the least, and is not merged.
     delta = np.where(mixture.weights > 0, mixture.weights * nearest, np.inf)
     limit = threshold * max(delta.min(), _RELEVANCE_FLOOR)
     irrelevant = np.isfinite(delta) & (delta > limit) & (nearest > _NEAR)
     irrelevant[np.argmin(delta)] = False
-    # All irrelevant components get one label, the others one each.
+    # All irrelevant components get one label, the others one each; then labels 0, 1, 2, ...
     labels = np.arange(mixture.n_components)
     labels[irrelevant] = mixture.n_components
-    return _merge_groups(mixture, np.unique(labels, return_inverse=True)[1])
+    consecutive = np.unique(labels, return_inverse=True)[1]
+    return _merge_groups(mixture, consecutive)
 
 
 @validated
@@ -266,7 +273,9 @@ def pivoted_qr(
     n_components: PositiveInt,
     rest: Literal["merge", "drop"] = "merge",
 ) -> ComponentShapes:
-    r"""Select the components that a pivoted QR of the matrix (33) finds independent, (42)-(43).
+    r"""Select the components that a pivoted QR finds independent: (42)-(43) of Semeraro et al.
+
+    The matrix, (33) there, has each component's density at each mean, relative to its peak.
 
     Parameters
     ----------
@@ -286,7 +295,7 @@ def pivoted_qr(
     if n_components >= shapes.n_components:
         return shapes
     mixture = shapes.with_equal_weights()
-    # The matrix (33): each component's density at each mean, relative to its peak.
+    # Entry (i, s): component s at the mean of component i, relative to its peak.
     logs = mixture.component_log_densities(shapes.means) - mixture.log_peaks
     order = qr(np.exp(logs), mode="r", pivoting=True)[1]
     # A merged component takes one of the places.
@@ -331,7 +340,10 @@ def gaussian_divergences(mixture: GaussianMixture, other: GaussianMixture) -> Ar
 
 
 def _absorb_into_heaviest(mixture: GaussianMixture, n_heaviest: int) -> GaussianMixture:
-    """Join every other component with the cheapest of the heaviest, all at once."""
+    """Join every other component with that of the heaviest with which its merger costs least.
+
+    All costs are those before any merger.
+    """
     weights, means, covs, _ = _whiten(mixture)
     order = np.argsort(-weights, kind="stable")
     heavy = order[:n_heaviest]
@@ -345,9 +357,11 @@ def _absorb_into_heaviest(mixture: GaussianMixture, n_heaviest: int) -> Gaussian
 
 
 def _whiten(mixture: GaussianMixture) -> tuple[Array, Array, Array, Array]:
-    """Copies in the frame of the global moments, and the root that leads back.
+    """Copy a mixture to coordinates z = L⁻¹ (x - m), in which it has mean 0 and covariance I.
 
-    The costs are the same there, and well scaled.
+    m and L Lᵀ are the moments of the whole mixture. Returns the weights (L,), means (L, d) and
+    covariances (L, d, d) there, and the root L (d, d). Runnalls' bounds are the same, since all
+    logarithms of determinants change by one constant; numbers are of the order of one.
     """
     root = np.linalg.cholesky(mixture.cov)
     inverse_root = np.linalg.solve(root, np.eye(mixture.dim))
@@ -359,7 +373,12 @@ def _whiten(mixture: GaussianMixture) -> tuple[Array, Array, Array, Array]:
 def pair_costs(
     weights: Array, means: Array, covs: Array, log_dets: Array, i: int, others: Indices
 ) -> Array:
-    """Runnalls' bound of component i with others; a pair without weight costs nothing."""
+    """Runnalls' bounds B_ij, as in :func:`runnalls`, of component i with others j, (n,), in nats.
+
+    Weights, means and covariances (L,), (L, d), (L, d, d) are those of a mixture, `log_dets` (L,)
+    those of the covariances, `others` (n,) indices. A pair without weight costs nothing, nor does
+    the component with itself.
+    """
     total = weights[i] + weights[others]
     # The share a = w_i / (w_i + w_j); equal shares where both weights are zero.
     equal = np.full(total.shape, 0.5)
@@ -377,7 +396,10 @@ def pair_costs(
 
 
 def _merge_groups(mixture: GaussianMixture, labels: Indices) -> GaussianMixture:
-    """Merge the components of equal label, so that each group keeps its moments."""
+    """Merge the components of equal label, so that each group keeps its weight and moments.
+
+    The labels (L,) are 0, ..., G - 1, which are also the places of the groups in the result.
+    """
     is_member = labels == np.arange(labels.max() + 1)[:, None]
     weights = is_member @ mixture.weights
     # Shares of a group's weight, (G, L); equal ones in a group without weight.

@@ -33,9 +33,9 @@ __all__ = [
 
 Fraction = Annotated[float, Bounds(above=0, below=1)]
 
-# Components lighter than this are not split.
+# Components lighter than this are not split: hardly anything in the density would change.
 _SMALLEST_WEIGHT = 1e-3
-# Rounds of splitting.
+# Rounds of splitting: a component can become 27, along directions that may differ.
 _MAX_ROUNDS = 3
 
 
@@ -68,11 +68,14 @@ def split_library(*, std: Fraction = 0.7) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=16)
 def _optimize_library(std: float) -> tuple[Array, Array]:
-    """Minimise the integrated squared difference from N(0, 1) over the outer weight a."""
+    """Return weights and means, (3,) each, of the library for a deviation s.
+
+    They minimise the integrated squared difference from N(0, 1) over the outer weight a.
+    """
     from scipy.optimize import minimize_scalar
 
     def components(a: float) -> tuple[Array, Array]:
-        # The variance s² + 2 a m² is 1.
+        # Weights a, 1 - 2 a, a at -m, 0, m, of which the variance s² + 2 a m² is 1.
         m = np.sqrt((1 - std**2) / (2 * a))
         return np.array([a, 1 - 2 * a, a]), np.array([-m, 0.0, m])
 
@@ -81,15 +84,16 @@ def _optimize_library(std: float) -> tuple[Array, Array]:
         exponent = -0.5 * np.square(difference) / variance
         return np.asarray(np.exp(exponent) / np.sqrt(variance))
 
-    def squared_error(a: float) -> float:
-        # ∫ (p - n)² dx = ∫ p² - 2 ∫ p n + a constant
+    def loss(a: float) -> float:
+        # ∫ (p - n)² dx = ∫ p² - 2 ∫ p n + a constant, with the mixture p and the normal density n
         weights, means = components(a)
         pairs = overlap(means[:, None] - means, 2 * std**2)
         square = weights @ pairs @ weights
         return float(square - 2 * weights @ overlap(means, 1 + std**2))
 
+    # The three weights a, 1 - 2a, a are positive between 0 and 1/2.
     result = minimize_scalar(
-        squared_error, bounds=(0.01, 0.49), method="bounded", options={"xatol": 1e-12}
+        loss, bounds=(0.01, 0.49), method="bounded", options={"xatol": 1e-12}
     )
     return components(float(result.x))
 
@@ -141,26 +145,41 @@ def split_gaussian(
     root = np.empty((d, d))
     root[order] = cholesky(cov[np.ix_(order, order)])
     root = root[:, : first.size]
-    reach = 2.5 if parts <= 8 else 3.0
-    std = reach / np.sqrt(reach**2 + 0.5625 * (parts - 1) ** 2)
-    places = 1.5 * std * (np.arange(parts) - (parts - 1) / 2)
-    # ∫ N(x; m, s²) N(x; n, s²) dx and ∫ N(x; m, s²) N(x; 0, 1) dx, both without 1/√(2π)
-    overlaps = np.exp(-(((places[:, None] - places) / (2 * std)) ** 2))
-    overlaps /= np.sqrt(2) * std
-    aim = np.exp(-0.5 * places**2 / (1 + std**2)) / np.sqrt(1 + std**2)
-    weights = np.linalg.solve(overlaps, aim)
-    weights /= weights.sum()
-    # The variance of the places and of a component add up to 1.
-    places *= np.sqrt((1 - std**2) / (weights @ places**2))
-    grid = np.stack(np.meshgrid(*[places] * first.size, indexing="ij"), axis=-1)
-    grid = grid.reshape(-1, first.size)
-    products = np.stack(np.meshgrid(*[weights] * first.size, indexing="ij"), axis=-1)
+    std, places, weights = _place_on_line(parts)
+    # Every combination of places along the axes, with the product of their weights.
+    n_axes = first.size
+    grid = np.stack(np.meshgrid(*[places] * n_axes, indexing="ij"), axis=-1)
+    grid = grid.reshape(-1, n_axes)
+    factors = np.stack(np.meshgrid(*[weights] * n_axes, indexing="ij"), axis=-1)
+    grid_weights = factors.reshape(-1, n_axes).prod(axis=1)
+    # P - (1 - s²) A Aᵀ for the columns A: along them a component has the deviation s.
     piece = symmetrise(cov - (1 - std**2) * root @ root.T)
     return GaussianMixture.construct(
-        products.reshape(-1, first.size).prod(axis=1),
+        grid_weights,
         mean + grid @ root.T,
         np.repeat(piece[None], len(grid), axis=0),
     )
+
+
+def _place_on_line(parts: int) -> tuple[float, Array, Array]:
+    """Return deviation, means (parts,) and weights (parts,) that approximate N(0, 1).
+
+    The mixture has mean 0 and variance 1; :func:`split_gaussian` has its formula.
+    """
+    reach = 2.5 if parts <= 8 else 3.0
+    # The outermost of means 1.5 s apart is at 0.75 s (n - 1), and 0.75² = 0.5625.
+    std = reach / np.sqrt(reach**2 + 0.5625 * (parts - 1) ** 2)
+    places = 1.5 * std * (np.arange(parts) - (parts - 1) / 2)
+    # The squared difference from N(0, 1) is wᵀ A w - 2 wᵀ b and a constant, least for A w = b, with
+    # A = ∫ N(x; m, s²) N(x; n, s²) dx and b = ∫ N(x; m, s²) N(x; 0, 1) dx, both without 1/√(2π).
+    overlaps = np.exp(-(((places[:, None] - places) / (2 * std)) ** 2))
+    overlaps /= np.sqrt(2) * std
+    overlaps_with_normal = np.exp(-0.5 * places**2 / (1 + std**2)) / np.sqrt(1 + std**2)
+    weights = np.linalg.solve(overlaps, overlaps_with_normal)
+    weights /= weights.sum()
+    # The variance of the places and of a component add up to 1.
+    places *= np.sqrt((1 - std**2) / (weights @ places**2))
+    return std, places, weights
 
 
 @validated
@@ -222,8 +241,10 @@ def split_components(
 ) -> GaussianMixture:
     r"""Replace some components by three along a direction, keeping their mean and covariance.
 
-    With :math:`\mathbf u=\mathbf S\mathbf v` for a unit vector v the pieces are
-    :math:`\mathcal N(\mathbf m+m_k\mathbf u,\ \mathbf P-(1-s^2)\mathbf u\mathbf u^\top)`.
+    With a square root S of P and :math:`\mathbf u=\mathbf S\mathbf v` for a unit vector v, the
+    pieces of :math:`\mathcal N(\mathbf m,\mathbf P)` are
+    :math:`\mathcal N(\mathbf m+m_k\mathbf u,\ \mathbf P-(1-s^2)\mathbf u\mathbf u^\top)`, where
+    :math:`m_k` and s are the means and the deviation of :func:`split_library`.
 
     Parameters
     ----------
@@ -315,6 +336,7 @@ def split_nonlinear(
         directions, lengths = nonlinearity(mixture.factors, jacobians, scale=scale)
         is_heavy = mixture.weights > _SMALLEST_WEIGHT
         costs = np.where(is_heavy, mixture.weights * lengths, 0.0)
+        # As many as there is room for, the most stretched first.
         worst = np.argsort(-costs, kind="stable")[:n_splits]
         worst = worst[costs[worst] > split_threshold]
         if not worst.size:

@@ -175,7 +175,7 @@ class AgentModels(Model):
     ) -> Array:
         """Derivative of a step from states (..., d), as (..., d, d)."""
         if self._team is not None:
-            # Differences of all agents' steps at once
+            # By differences of `step`, which moves all agents at once
             return super().jacobian(x, t, dt, std=std)
         slopes = []
         for agent, (model, own) in enumerate(self._pair(x)):
@@ -186,7 +186,7 @@ class AgentModels(Model):
         return self._stack(slopes)
 
     def _noise_of_team(self, team: _Team, x: Array, t: float, dt: float) -> Array:
-        """Return the noise of agents that move alike, at once."""
+        """Return the covariances of a step's noise for the agents of a team, like `noise_at`."""
         own = np.moveaxis(x, self.agent_axis, 0)
         input_cov = _insert_axes(team.input_covs, own.ndim + 1)
         cov = add_up_noise(team.move, team.pieces(t, dt, own.ndim), own, input_cov)
@@ -195,7 +195,7 @@ class AgentModels(Model):
         return np.moveaxis(cov, 0, self.agent_axis)
 
     def _pair(self, x: Array) -> list[tuple[Model, Array]]:
-        """Return each agent's model and states."""
+        """Return each agent's model with its states, (..., d) without the axis of agents."""
         axis = self.agent_axis
         if x.ndim < axis + 2 or x.shape[axis] != self.n_agents:
             raise ValueError(
@@ -206,14 +206,19 @@ class AgentModels(Model):
         return list(zip(self.models, own, strict=True))
 
     def _stack(self, values: list[Array]) -> Array:
+        """Return the agents' arrays as one, with their axis where the states have it."""
         return np.stack(values, axis=self.agent_axis)
 
 
 @dataclass(frozen=True, eq=False)
 class _Team:
-    """Agents whose inputs hold at the same times and move their states by the same function."""
+    """Agents whose inputs hold at the same times and move their states by the same function.
+
+    One call of the function then moves them all.
+    """
 
     move: Callable[[Array, Array, float], Array]
+    """``move(x, u, dt)`` on states (A, ..., d) and inputs (A, ..., k)."""
     inputs: Inputs
     """Those of all agents side by side, (T, A k)."""
     input_covs: Array
@@ -229,7 +234,10 @@ class _Team:
 
 
 def _read_team(models: Sequence[Model]) -> _Team | None:
-    """Return the inputs of models that differ in them alone, or None."""
+    """Return the models as a team if they differ in the inputs' values and covariances alone.
+
+    Otherwise return None: each agent then has to be moved by itself.
+    """
     inputs = []
     moves = []
     for model in models:
@@ -243,7 +251,7 @@ def _read_team(models: Sequence[Model]) -> _Team | None:
         if not is_alike or not np.array_equal(other.times, first.times):
             return None
     values = np.concatenate([one.values for one in inputs], axis=1)
-    # Of this covariance nothing is read.
+    # The covariance of these joint inputs is never used: each agent has its own, returned beside.
     side_by_side = Inputs(first.times, values, np.zeros((values.shape[1],) * 2))
     return _Team(moves[0], side_by_side, np.stack([one.cov for one in inputs]))
 

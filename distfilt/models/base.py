@@ -217,8 +217,11 @@ class Model(FrozenModel):
 
 @lru_cache(maxsize=64)
 def _check_noise(data: bytes, dim: int) -> Array:
-    """Return a covariance that is one, cached: few of them recur in every step of a run."""
-    # The array is read-only, as all callers share it.
+    """Return the covariance (dim, dim) that some bytes hold, or refuse it if it is none.
+
+    The bytes, which are its entries, are the key of the cache: few covariances recur in every step
+    of a run. The array is read-only, as all callers share it.
+    """
     cov = np.frombuffer(data).reshape(dim, dim)
     check_array(cov, "noise_cov")
     check_positive_semidefinite(cov, "noise_cov")
@@ -227,7 +230,10 @@ def _check_noise(data: bytes, dim: int) -> Array:
 
 @lru_cache(maxsize=64)
 def _factor_noise(data: bytes, dim: int) -> Array:
-    """Return the factor of a covariance, cached and read-only; only draws need it."""
+    """Return the factor L of a covariance L Lᵀ that some bytes hold, read-only.
+
+    It is cached as in `_check_noise`, and apart from it, since only draws need the factor.
+    """
     lower = factor(np.frombuffer(data).reshape(dim, dim))
     lower.setflags(write=False)
     return lower
@@ -289,7 +295,7 @@ class LinearModel(Model):
         """Build the model from its matrix, ``transition_matrix(dt)`` or ``(t, dt)``, to (d, d)."""
         return cls(
             dim,
-            partial(_multiply, transition_matrix, dim, _takes_two(transition_matrix)),
+            partial(_multiply, transition_matrix, dim, _takes_time(transition_matrix)),
             noise_cov,
             names=names,
             units=units,
@@ -309,6 +315,7 @@ class LinearModel(Model):
         return call_batched(self, "transition", (x,), t, dt)
 
     def _noise_cov(self, t: float, dt: float) -> Array:
+        """Return the noise covariance, read-only; made once for each dt if time does not matter."""
         if self.time_invariant:
             return _noise_of_step(self, dt)
         return self._compute_noise_cov(t, dt)
@@ -333,12 +340,13 @@ class LinearModel(Model):
 
     def _is_transposed(self, t: float, dt: float, cov: Array) -> bool:
         """Whether Φᵀ in place of Φ makes two half steps add the noise of a whole step."""
-        # The noise of two half steps, propagated by Φ, is that of a whole step.
+        # The noise of a whole step is that of the first half, propagated by Φ of the second half,
+        # plus that of the second half.
         half = dt / 2
         phi = self.F(half, t + half)
         first = call_user(self.noise_cov, t, half)
         second = call_user(self.noise_cov, t + half, half)
-        # Q(t, dt) = Φ Q(t, dt/2) Φᵀ + Q(t + dt/2, dt/2)
+        # Q(t, dt) = Φ Q(t, dt/2) Φᵀ + Q(t + dt/2, dt/2), with Φ from t + dt/2 to t + dt
         remainder = second - cov
         error = np.abs(phi @ first @ phi.T + remainder).max()
         transposed_error = np.abs(phi.T @ first @ phi + remainder).max()
@@ -349,7 +357,7 @@ class LinearModel(Model):
     @cached_property
     def varies_with_time(self) -> bool:
         """Whether the matrix depends on the time at which a step begins, ``(t, dt)``."""
-        return _takes_two(self.transition_matrix)
+        return _takes_time(self.transition_matrix)
 
     @validated
     def F(self, dt: NonNegativeFloat, t: float | None = None) -> Array:
@@ -382,8 +390,8 @@ class LinearModel(Model):
         return np.full((*x.shape, self.dim), phi)
 
 
-def _takes_two(function: Callable[..., Array]) -> bool:
-    """Whether a function needs two arguments, (t, dt), and not dt alone."""
+def _takes_time(function: Callable[..., Array]) -> bool:
+    """Whether a transition matrix is a function of (t, dt), and not of dt alone."""
     try:
         parameters = signature(function).parameters.values()
     except (TypeError, ValueError):
@@ -410,7 +418,7 @@ def _multiply(
     t: float,
     dt: float,
 ) -> Array:
-    """Transition of a linear model."""
+    """Move states (..., d) by a transition matrix: the transition of a linear model."""
     args = (t, dt) if varies_with_time else (dt,)
     phi = _make_matrix(transition_matrix, dim, *args)
     # Rows are states: x Φᵀ. With a copy of the transpose it takes half the time of a view's.

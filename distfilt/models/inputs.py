@@ -64,21 +64,23 @@ class Inputs(FrozenModel):
             raise ValueError("times must have at least one entry, got none")
 
     def pieces(self, t: float, dt: float) -> list[Piece]:
-        """Return the parts of a step in which one input holds: begin, length and input."""
+        """Return the parts of a step in which one input holds: (begin, length, input)."""
         if t < self.times[0]:
             raise ValueError(
                 f"times must begin at the model's first step at {format_number(t)} or before, "
                 f"got {format_number(self.times[0])}"
             )
         end = t + dt
-        # To rounding: a sum of steps may fall short of the time of an input.
+        # A sum of steps may miss the time of an input by rounding. An input that begins within this
+        # time of an end of the step begins at that end, so that no piece is that short.
         tolerance = 1e-9 * max(1.0, abs(t))
         first = int(np.searchsorted(self.times, t + tolerance, side="right")) - 1
         last = int(np.searchsorted(self.times, end - tolerance, side="left"))
+        # The inputs `first` to `last` - 1 hold within the step; each but the first begins in it.
         edges = [t, *self.times[first + 1 : last].tolist(), end]
         return [
-            (a, b - a, self.values[first + k])
-            for k, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True))
+            (begin, stop - begin, self.values[first + k])
+            for k, (begin, stop) in enumerate(zip(edges[:-1], edges[1:], strict=True))
         ]
 
 
@@ -86,10 +88,12 @@ class Inputs(FrozenModel):
 class InputModel(Model):
     r"""A model that is driven by inputs with noise, x(t + dt) = f(x, u + ε, dt) + w.
 
-    The inputs' noise enters where the inputs do, so that it is that of the body's frame: with
+    The noise ε has the covariance :math:`\boldsymbol\Sigma` of the inputs. It enters where the
+    inputs do, in the body's own axes. With
     :math:`\mathbf G(\mathbf x)=\partial\mathbf f/\partial\mathbf u` its covariance in the state is
-    :math:`\mathbf G\boldsymbol\Sigma\mathbf G^\top`, which depends on the state. Members move with
-    draws of the inputs; Gaussian filters use G at their mean. Made by :meth:`from_inputs`.
+    :math:`\mathbf G\boldsymbol\Sigma\mathbf G^\top`, which depends on the state. Members of an
+    ensemble move with draws of the inputs; Gaussian filters use G at their mean. Made by
+    :meth:`from_inputs`.
 
     Parameters
     ----------
@@ -154,7 +158,7 @@ class InputModel(Model):
         rng: Rng,
     ) -> Array:
         """Move states (..., d) from `t` to `t` + `dt`, each with draws of the inputs' noise."""
-        # The check of `transition` is made here too.
+        # At the first use a step checks `transition`; its result is not needed.
         self.step(x, t, dt)
         root = factor(self.inputs.cov)
         for _, length, u in self.inputs.pieces(t, dt):
@@ -174,6 +178,7 @@ class InputModel(Model):
 
 
 def _no_noise(dim: int, t: float, dt: float) -> Array:
+    """Return the covariance of a model without noise beyond that of its inputs."""
     return np.zeros((dim, dim))
 
 
@@ -184,7 +189,10 @@ def _drive(
     t: float,
     dt: float,
 ) -> Array:
-    """Move states (..., d) from `t` to `t` + `dt` by the measured inputs, without their noise."""
+    """Move states (..., d) from `t` to `t` + `dt` by the measured inputs, without their noise.
+
+    The inputs that hold in this interval are applied one after the other.
+    """
     return move_by_inputs(driven_transition, inputs.pieces(t, dt), x)
 
 
@@ -193,7 +201,7 @@ def move_by_inputs(
     pieces: Iterable[Piece],
     x: Array,
 ) -> Array:
-    """Move states (..., d) by one input after the other, which broadcast to them."""
+    """Move states (..., d) by one input after the other; inputs broadcast to the states."""
     for _, length, u in pieces:
         x = _move(driven_transition, x, u, length)
     return x
@@ -238,7 +246,10 @@ def _move(
     u: Array,
     dt: float,
 ) -> Array:
-    """Move states (..., d) by inputs (..., k) that broadcast to them."""
+    """Move states (..., d) by inputs (..., k) that broadcast to them, and check the result.
+
+    The user's function gets copies, which it may change.
+    """
     inputs = np.broadcast_to(u, (*x.shape[:-1], u.shape[-1])).copy()
     moved = call_user(driven_transition, x.copy(), inputs, dt)
     return check_array(moved, "driven_transition", x.shape, finite=False)

@@ -75,6 +75,7 @@ def constant_velocity(
 
 
 def _straight_transition(dt: float, axes: int) -> Array:
+    """Return the matrix of straight motion: p + v dt and v, positions before velocities."""
     return _repeat_along_axes(((1.0, dt), (0.0, 1.0)), axes)
 
 
@@ -146,7 +147,8 @@ def runge_kutta(
     h = dt / steps
     for k in range(steps):
         s = t + k * h
-        # Weighted mean of four slopes: x + h/3 (k1/2 + k2 + k3 + k4/2).
+        # x + h/6 (k1 + 2 k2 + 2 k3 + k4) with four slopes: k1 here, k2 and k3 halfway, k4 at the
+        # end. It is computed as x + h/3 (k1/2 + k2 + k3 + k4/2).
         # The rate may work in place: it gets arrays of its own, and its result is used before it
         # is called again.
         slope = check_array(rate(x.copy("K"), s), "rate", x.shape, finite=False)
@@ -197,12 +199,14 @@ def integrate(
 
 
 def _rk4_transition(x: Array, t: float, dt: float, rate: Rate, longest: float) -> Array:
+    """Move states (..., d) from `t` to `t` + `dt` by Runge-Kutta steps of `longest` at most."""
     # Fortran order: each component of all states is contiguous in memory, which is twice as fast.
     states = x.copy("F")
     return np.ascontiguousarray(runge_kutta(rate, states, t, dt, longest))
 
 
 def _white_noise(density: Array, t: float, dt: float) -> Array:
+    """Return the covariance that white noise of a spectral density (d, d) accumulates in `dt`."""
     return density * dt
 
 

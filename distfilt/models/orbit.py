@@ -88,7 +88,7 @@ def potential(position: Position) -> Array:
 
 @validated
 def acceleration(position: Position) -> Array:
-    r"""Acceleration of a satellite, in km/s²: equation (47), corrected.
+    r"""Acceleration of a satellite, in km/s²: (47) of Semeraro et al., corrected.
 
     .. math:: \mathbf a=-\frac{\mu\mathbf r}{r^3}+\frac{J_2\mu R^2}{2r^5}
         \Bigl[15\mathbf r\frac{z^2}{r^2}-3\mathbf r-6z\,\hat{\mathbf k}\Bigr]
@@ -177,10 +177,14 @@ def propagate(
 
 
 def _dop853(x: Array, h: float) -> Array:
-    """E. Hairer, S. Norsett and G. Wanner, Solving Ordinary Differential Equations I (1993)."""
+    """Move states (..., 6) by one step of `h` seconds of Dormand and Prince's rule of order 8.
+
+    E. Hairer, S. Norsett and G. Wanner, Solving Ordinary Differential Equations I (1993).
+    """
     from scipy.integrate import DOP853
 
-    # The tableau: k_i = f(x + h Σ a_ij k_j), x + h Σ b_i k_i. The equations do not depend on time.
+    # The rule's coefficients a and b: slopes k_i = f(x + h Σ_j a_ij k_j) and the result
+    # x + h Σ_i b_i k_i. Its times are not needed, as the equations do not depend on time.
     a = h * DOP853.A[:12, :12]
     b = h * DOP853.B
     slopes = np.empty((12, *x.shape))
@@ -208,7 +212,7 @@ def orbits(
         Number of satellites; each has 6 components of the state.
     position_std, velocity_std : float
         Standard deviations of the noise that a step adds to each component, in km and m/s,
-        independent of the step's length, (50)-(51).
+        independent of the step's length: (50)-(51) of Semeraro et al.
 
     Examples
     --------
@@ -231,24 +235,30 @@ def orbits(
 
 
 def _constant_noise(noise_cov: Array, t: float, dt: float) -> Array:
+    """Return the covariance (d, d) that every step adds, whatever its length."""
     return noise_cov
 
 
 def _transition(x: Array, t: float, dt: float) -> Array:
-    # Each satellite moves independently of the others.
+    """Move states (..., 6 bodies) by `dt` seconds: each satellite independently of the others."""
     states = x.reshape(*x.shape[:-1], -1, 6)
     return propagate(states, dt).reshape(x.shape)
 
 
 def _derivative(x: Array, t: float, dt: float, bodies: int) -> Array:
-    """Central differences, body by body: the motion of a body depends on its own state only."""
+    """Jacobian (..., d, d) of `_transition` by central differences, body by body.
+
+    The motion of a body depends on its own state only, so that the Jacobian is block diagonal.
+    """
+    # 10 m or 1 cm/s: small beside an orbit, so that curvature does not count, and large beside the
+    # rounding of positions, below 1e-11 km.
     step = 1e-2
     states = x.reshape(*x.shape[:-1], bodies, 1, 6)
     shifts = step * np.eye(6)
     # Axes: bodies, the component that is shifted, and the components where the orbit ends.
     forward, backward = _transition(np.stack([states + shifts, states - shifts]), t, dt)
     blocks = np.swapaxes((forward - backward) / (2 * step), -1, -2)
-    # Block diagonal
+    # One block for each body on the diagonal
     jacobian = np.zeros((*x.shape, x.shape[-1]))
     for k in range(bodies):
         body = slice(6 * k, 6 * k + 6)

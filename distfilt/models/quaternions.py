@@ -32,10 +32,12 @@ __all__ = [
 
 
 def _check_nonzero(value: Array, name: str) -> None:
+    """Refuse quaternions (..., 4) whose squared length is zero, or infinite, in floating point."""
     with np.errstate(over="ignore", under="ignore"):
         # Underflow and overflow are refused below, without a warning.
         squares = (value**2).sum(axis=-1)
-    # A length whose square underflows or overflows cannot be divided out.
+    # A length whose square underflows or overflows cannot be divided out. Squares below 1e-308 have
+    # lost digits; the limit leaves a margin for the sum of four.
     if not (np.isfinite(squares) & (squares > 1e-280)).all():
         largest = np.abs(value).max()
         raise ValueError(
@@ -49,7 +51,7 @@ Vector = Annotated[ArrayInput, "... 3"]
 
 @validated
 def cross_matrix(vector: Vector) -> Array:
-    r"""The cross product :math:`[\boldsymbol\omega]_\times` as a matrix (..., 3, 3), equation (19).
+    r"""The matrix :math:`[\boldsymbol\omega]_\times` of a cross product: (19) of Grange et al.
 
     Parameters
     ----------
@@ -87,9 +89,9 @@ def rotation_matrix(quaternion: Quaternion) -> Array:
 
 
 def _to_rotation(quaternion: Array) -> Rotation:
+    """Return scipy's rotations of quaternions (..., 4), with all leading axes in one."""
     from scipy.spatial.transform import Rotation
 
-    # It takes one leading axis.
     return Rotation.from_quat(quaternion.reshape(-1, 4), scalar_first=True)
 
 
@@ -97,8 +99,8 @@ def _to_rotation(quaternion: Array) -> Rotation:
 def left_directions(quaternion: Quaternion) -> Array:
     r"""Derivatives of a quaternion with respect to small rotations about the frame's axes.
 
-    This is the derivative D of :func:`rotate` in its angle, at zero. Equation (21) is
-    :math:`\dot{\mathbf q} = -\mathbf D(\mathbf q)\,\boldsymbol\omega`.
+    This is the derivative D of :func:`rotate` in its angle, at zero. Equation (21) of Grange et al.
+    is :math:`\dot{\mathbf q} = -\mathbf D(\mathbf q)\,\boldsymbol\omega`.
 
     Parameters
     ----------
@@ -178,7 +180,7 @@ def rotation_vector_between(quaternion: Quaternion, other: Quaternion) -> Array:
 
 @validated
 def quaternion_rate(quaternion: Quaternion, angular_velocity: Vector) -> Array:
-    """Derivative of the quaternion in 1/s, (..., 4), equation (21); it conserves the length.
+    """Derivative of the quaternion in 1/s, (..., 4): (21) of Grange et al. It conserves the length.
 
     Parameters
     ----------
@@ -198,7 +200,11 @@ def quaternion_rate(quaternion: Quaternion, angular_velocity: Vector) -> Array:
 
 
 def component_rates(q: Array, w: Array) -> list[Array]:
-    """Right-hand side of (21) with components first, for contiguous memory."""
+    """Right-hand side of (21) of Grange et al. with components first, for contiguous memory.
+
+    It is q̇ = -D(q) ω with the matrix D of :func:`left_directions`, for the quaternion (a, b, c, d)
+    whose scalar part is a; `q` is (4, ...), `w` the angular velocity (3, ...) in rad/s.
+    """
     a, b, c, d = q
     w1, w2, w3 = w
     return [

@@ -38,8 +38,12 @@ def _drift(rate: float) -> Array:
 
 @lru_cache(maxsize=64)
 def _transition_matrix(dt: float, rate: float) -> Array:
-    """The exact matrix exp(A dt); Journal of the Aerospace Sciences 27 (1960) 653-658."""
+    """The exact matrix exp(A dt), (6, 6), of the Clohessy-Wiltshire equations.
+
+    W. H. Clohessy and R. S. Wiltshire, Journal of the Aerospace Sciences 27 (1960) 653-658.
+    """
     n = rate
+    # The angle, in rad, that the chief moves on its orbit
     tau = rate * dt
     s = np.sin(tau)
     c = np.cos(tau)
@@ -60,14 +64,15 @@ def _transition_matrix(dt: float, rate: float) -> Array:
 
 @lru_cache(maxsize=64)
 def _noise_integral(rate: float, sigma: float, dt: float) -> Array:
-    """∫ exp(A s) σ² exp(A s)ᵀ ds over a step, by one matrix exponential.
+    """The covariance Q = ∫ exp(A s) σ² exp(A s)ᵀ ds over a step, (6, 6), by one matrix exponential.
 
+    `rate` is that of the orbit, in rad/s, and `sigma` the noise's σ of `clohessy_wiltshire`.
     C. F. Van Loan, IEEE Transactions on Automatic Control 23 (1978) 395-404.
     """
     a = _drift(rate)
     # White noise on all six rows of the equations
     density = sigma**2 * np.eye(6)
-    # exp of [[-A, σ²], [0, Aᵀ]] dt is [[., Φ⁻¹ Q], [0, Φᵀ]].
+    # exp of [[-A, σ² I], [0, Aᵀ]] dt is [[Φ⁻¹, Φ⁻¹ Q], [0, Φᵀ]], with Φ = exp(A dt).
     blocks = expm(dt * np.block([[-a, density], [np.zeros((6, 6)), a.T]]))
     phi = blocks[6:, 6:].T
     cov = symmetrise(phi @ blocks[:6, 6:])
@@ -76,6 +81,7 @@ def _noise_integral(rate: float, sigma: float, dt: float) -> Array:
 
 
 def _noise(t: float, dt: float, rate: float, sigma: float) -> Array:
+    """Return the covariance (6, 6) of a step's noise, which does not depend on the time."""
     return _noise_integral(rate, sigma, dt)
 
 
@@ -159,19 +165,23 @@ def _pose_transition(x: Array, t: float, dt: float, rate: float, step: float) ->
 
 
 def _attitude_rate(rows: Array, t: float, alpha: float) -> Array:
-    """Right-hand sides of (20) and (21) together, components first."""
+    """Right-hand sides of (20) and (21) of Grange et al. together, (7, ...), components first.
+
+    Rows 0 to 2 are the angular velocity in rad/s, 3 to 6 the quaternion; `alpha` is the chief's
+    orbital rate, in rad/s.
+    """
     w = rows[:3]
     q = rows[3:]
     return np.array(_angular_acceleration(q, w, alpha) + component_rates(q, w))
 
 
 def _angular_acceleration(q: Array, w: Array, alpha: float) -> list[Array]:
-    r"""The angular velocity's derivative, equation (20), components first.
+    r"""The angular velocity's derivative, (20) of Grange et al., components first.
 
     :math:`\dot{\boldsymbol\omega} = [\boldsymbol\omega]_\times\mathbf R(\mathbf q)\,(0, 0,
-    \alpha)^\top`: only the third column of R is needed. The paper leaves open how the body turns in
-    the inertial frame; no torque acts on it here and its moments of inertia are equal, so that term
-    is zero.
+    \alpha)^\top` with the orbital rate α in rad/s: only the third column of R is needed. The
+    paper's (20) has a further term, the body's acceleration in the inertial frame, and leaves it
+    open. Here it is zero: no torque acts, and the moments of inertia are equal.
     """
     a, b, c, d = q
     w1, w2, w3 = w

@@ -33,7 +33,8 @@ Positions = Annotated[ArrayInput, "... self.dim"]
 def _reflect(x: Array, low: Array, high: Array) -> Array:
     """Fold positions back into a box with reflecting walls."""
     width = high - low
-    # A triangular wave of period 2 width: 0 at the lower wall, width at the upper one.
+    # A path on between mirrors: a triangular wave of period 2 width, which is 0 at the lower wall
+    # and `width` at the upper one.
     folded = np.abs((x - low + width) % (2 * width) - width)
     # The sum of low and a rounded width may lie one bit beyond the wall.
     return np.clip(low + folded, low, high)
@@ -310,4 +311,5 @@ def rotating_swarm(
 def _score_drift(
     x: Array, t: float, mobility: float, mixture: RotatingMixture
 ) -> Array:
+    """Return the drift c ∇f/f at positions (..., 2), with the mobility c."""
     return np.asarray(mobility * mixture.score(x, t))

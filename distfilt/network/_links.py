@@ -96,8 +96,8 @@ def _is_adjacency(numbers: np.ndarray, n_agents: int | None) -> bool:
     size = numbers.shape[0]
     if size == 0 or n_agents not in (None, size):
         return False
-    # Two edges look like a matrix of two agents, which has no self-loops and no number
-    # above 1.
+    # A list of two edges is a 2 x 2 array too. A matrix of two agents has a zero diagonal and no
+    # number above 1; any other array is taken for edges.
     looks_like_edges = numbers.diagonal().any() or (numbers > 1).any()
     return not (size == 2 and looks_like_edges)
 
@@ -140,13 +140,13 @@ def order_nodes(
         if len(order) != len(nodes) or set(order) != labels or len(names) != len(nodes):
             raise ValueError(f"graph must have the nodes {list(names)}, got {nodes}")
         return order
-    # Other labels have no order of their own.
-    # The keys of integers are tuples too, so that all can be compared.
+    # Integers, and tuples of integers, are sorted; other labels keep the graph's order.
     return sorted(nodes, key=_integers) if _are_integers(nodes) else nodes
 
 
 def _are_integers(nodes: Sequence[Hashable]) -> bool:
-    """Whether labels are integers, or tuples of as many integers each."""
+    """Whether labels are all integers, or all tuples of integers of one length."""
+    # Whether each label is a tuple, and of how many entries.
     kinds = set()
     for node in nodes:
         entries = node if isinstance(node, tuple) else (node,)
@@ -175,8 +175,8 @@ def build_links(n_agents: int, pairs: Indices, name: str) -> scipy.sparse.csr_ar
     ones = np.ones(len(pairs))
     coordinates = (pairs[:, 0], pairs[:, 1])
     links = scipy.sparse.csr_array((ones, coordinates), (n_agents, n_agents))
-    # Repeated pairs add up; each link counts once. The order of links is that of the
-    # columns.
+    # Repeated pairs add up, but each link counts once. Sorted, links are in the order of
+    # (receiver, sender).
     links.sum_duplicates()
     links.data[:] = 1.0
     links.sort_indices()

@@ -94,11 +94,11 @@ def gaussian_belief_propagation(
     if rounds is None:
         rounds = max(graph.diameter, 1) if graph.is_connected else graph.n_agents
     for _ in range(rounds):
-        matrix, vector = _collect(matrices, vectors, received, channel)
+        matrix, vector = _add_received(matrices, vectors, received, channel)
         # M and h: all that the sender knows without the receiver's own message
-        known, eta = unpack_information(received, d)
-        m = matrix[..., graph.senders, :, :] - known[..., reverse, :, :]
-        h = vector[..., graph.senders, :] - eta[..., reverse, :]
+        last_lambda, last_eta = unpack_information(received, d)
+        m = matrix[..., graph.senders, :, :] - last_lambda[..., reverse, :, :]
+        h = vector[..., graph.senders, :] - last_eta[..., reverse, :]
         # Λ = -J_ij M⁻¹ J_ji and η = -J_ij M⁻¹ h in one solve
         right = np.concatenate(
             [np.broadcast_to(couplings.mT, m.shape), h[..., None]], axis=-1
@@ -109,15 +109,18 @@ def gaussian_belief_propagation(
         arrived = channel.send_on_links(packed)
         received = np.where(np.isnan(arrived), received, arrived)
     # The marginal: P_i⁻¹ = J_ii + Σ Λ and P_i⁻¹ m_i = h_i + Σ η
-    matrix, vector = _collect(matrices, vectors, received, channel)
+    matrix, vector = _add_received(matrices, vectors, received, channel)
     covs = symmetrise(_invert(matrix))
     return (covs @ vector[..., None])[..., 0], covs
 
 
-def _collect(
+def _add_received(
     matrices: Array, vectors: Array, received: Array, channel: Channel
 ) -> tuple[Array, Array]:
-    """Return each agent's own information with all that it has received."""
+    """Return J_ii + Σ Λ, (*runs, A, d, d), and h_i + Σ η, (*runs, A, d), of all that has arrived.
+
+    `received` has the last message of each link, packed by `pack_information`.
+    """
     graph = channel.graph
     d = vectors.shape[-1]
     total = graph._sum_by_receiver(received, received.ndim - 2)

@@ -44,7 +44,7 @@ _BILLS = (
 """The counts of a ledger by link, and by broadcast."""
 
 _BLOCK_SIZE = 2**15
-"""Number of messages whose losses are drawn at a time."""
+"""Number of messages whose losses are drawn at a time: few enough to stay in the cache."""
 
 _Values = Annotated[ArrayInput, "*self.runs self.graph.n_agents k"]
 
@@ -67,9 +67,9 @@ P = TypeVar("P", bound=Payload)
 class _Size(NamedTuple):
     """The scalars and bytes of a round's messages: one number, or one for each link or agent.
 
-    Those of a `transmission` that reaches all receivers of an agent are None if each
-    message is a transmission of its own. It `is_common` if the messages on the agent's
-    links are of its size.
+    `transmission` has the scalars and bytes of a radio transmission that reaches all receivers of
+    an agent at once; it is None if each message needs a transmission. With `is_common`, each
+    message on the agent's links is as large as the transmission.
     """
 
     scalars: int | Counts
@@ -137,11 +137,11 @@ class Channel:
         # Whether a graph of several parts is expected, and no reason for a warning.
         self.expects_parts = False
         self._ledger = Ledger.empty(self.graph.n_agents) if ledger is None else ledger
-        # Losses are drawn for `_n_drawn` runs, of which this channel's are `_drawn`.
-        self._n_drawn = math.prod(runs)
-        self._drawn = slice(None)
-        # Rounds without faults that are not yet in the ledger, by the size of a
-        # message.
+        # Losses are drawn for all runs of the batch, so that a channel that :meth:`for_run` made
+        # for one of them loses the same messages.
+        self._n_all_runs = math.prod(runs)
+        self._own_runs = slice(None)
+        # Number of rounds without faults that are not yet in the ledger, by message size.
         self._uncharged: dict[int, int] = {}
         # Messages on their way in a channel with a delay, by the shape of the values.
         self._queues: dict[tuple[int, ...], tuple[deque[Array], deque[Mask]]] = {}
@@ -157,17 +157,25 @@ class Channel:
             return make(*args, **options)
 
     def for_run(self, run: Indices, ledger: Ledger) -> Channel:
-        """Return a copy with another ledger, for all runs of an array or for a single one.
+        """Return a copy with another ledger, for the runs that an array numbers, or for one.
 
-        A single run, an array without axes, loses the messages that it loses among all.
+        Parameters
+        ----------
+        run : ndarray of int, (*runs) or ()
+            Numbers of all runs of the channel, or the number of one of them, without axes. That
+            one loses the same messages as in the channel of all runs.
+        ledger : Ledger
+            The copy's ledger.
         """
+        # A copy of all attributes, without the checks of the constructor.
         channel = object.__new__(type(self))
         vars(channel).update(vars(self))
         channel.runs = run.shape
         channel._ledger = ledger
         channel._uncharged = {}
         channel._queues = {}
-        channel._drawn = slice(None) if run.ndim else slice(run, run + 1)
+        # Losses are drawn for all runs; of them the copy takes those of its own.
+        channel._own_runs = slice(None) if run.ndim else slice(run, run + 1)
         return channel
 
     @property
@@ -366,7 +374,7 @@ class Channel:
         self, values: Array, weights: ConsensusWeights, rounds: int
     ) -> Array:
         """Mix values (*runs, A, k) in rounds in which every message arrives at once."""
-        # The ledger is brought up to date when it is read: it would cost more than the
+        # The ledger adds these rounds when it is read: each time it would cost more than the
         # product.
         size = values.shape[-1]
         self._uncharged[size] = self._uncharged.get(size, 0) + rounds
@@ -390,7 +398,11 @@ class Channel:
     def _mix_rounds(
         self, values: Array, weights: ConsensusWeights, on_loss: LossRule, rounds: int
     ) -> Iterator[tuple[Array, Array]]:
-        """Mix with faults; after each round the values, and the weights that own values got."""
+        """Mix values (*runs, A, k) in rounds with faults.
+
+        Yield after each round the values, and the weights that the agents' own values got,
+        (*runs, A): these grow where the weight of a lost message stays with the receiver.
+        """
         both_ways = on_loss in ("mutual", "metropolis")
         if both_ways and self.graph.is_directed:
             raise ValueError(
@@ -398,12 +410,11 @@ class Channel:
                 f"{on_loss!r} on a graph with one-way links, which needs links both ways"
             )
         size = values.shape[-1]
-        # Metropolis weights need the degree of the links that are left, one number
-        # more.
+        # Metropolis weights need the sender's number of working links: one number more.
         numbers = size + 1 if on_loss == "metropolis" else size
         flat = values.reshape(-1, size)
         # Losses and weights of many rounds at once, as many as the cache holds.
-        block = max(1, _BLOCK_SIZE // (1 + self._n_drawn * self.graph.senders.size))
+        block = max(1, _BLOCK_SIZE // (1 + self._n_all_runs * self.graph.senders.size))
         while rounds > 0:
             used = np.ones(self.graph.senders.size, dtype=bool)
             count = min(rounds, block)
@@ -419,11 +430,27 @@ class Channel:
     def _mix_block(
         self, flat: Array, weights: ConsensusWeights, arrived: Mask, on_loss: LossRule
     ) -> Iterator[tuple[Array, Array]]:
-        """Mix values (R A, k) in rounds of which messages have arrived, (rounds, R, E)."""
+        """Mix values of R runs in rounds of which it is known which messages arrive.
+
+        Parameters
+        ----------
+        flat : ndarray, (R A, k)
+            The agents' values, one run below the other.
+        weights, on_loss
+            As for :meth:`mix`.
+        arrived : ndarray of bool, (rounds, R, E)
+            Whether each link delivers its message.
+
+        Yields
+        ------
+        values, self_weights : ndarray, (R A, k) and (R, A)
+            After each round.
+        """
         graph = self.graph
+        # Rows by which delayed values lie below the present ones in the product; 0 without a delay.
         offset = 0
         if self.faults.total_delay:
-            # Which messages of earlier rounds arrive now; their values follow below.
+            # The messages that arrive now were sent in earlier rounds.
             offset = len(flat)
             arrived = self._delay_arrivals(flat.shape, arrived)
         n_rounds, n_runs, n_links = arrived.shape
@@ -433,18 +460,18 @@ class Channel:
         matrix = stack_weights(
             graph, self_weights[:n_runs], link_weights[:n_runs], received_offset=offset
         )
-        # The matrices of all rounds differ in their entries only.
+        # The matrices of all rounds have their entries at the same places: only the entries change.
         entries = interleave_weights(graph, self_weights, link_weights)
         entries = entries.reshape(n_rounds, -1)
         by_round = self_weights.reshape(n_rounds, n_runs, graph.n_agents)
         for k in range(n_rounds):
             matrix.data = entries[k]
-            factors = flat
+            present_and_late = flat
             if offset:
-                # Own values are present, received ones late: they stand below in one
-                # product.
-                factors = np.concatenate([flat, self._delay_values(flat)])
-            flat = matrix @ factors
+                # An agent's own value is of this round, those received are late. Appended
+                # below, they take part in the same product.
+                present_and_late = np.concatenate([flat, self._delay_values(flat)])
+            flat = matrix @ present_and_late
             yield flat, by_round[k]
 
     def _delay_values(self, values: Array) -> Array:
@@ -474,7 +501,7 @@ class Channel:
         acknowledged: bool = False,
         is_broadcast: bool = True,
     ) -> Mask:
-        """Send so many floats over some links, all by default; which arrive, (R, E)."""
+        """Send so many floats over links (E,), all by default; return which arrive, (R, E)."""
         if links is None:
             links = np.ones(self.graph.senders.size, dtype=bool)
         size = _Size.of_floats(numbers)
@@ -493,10 +520,10 @@ class Channel:
             arrived = self._transmit_rounds(1, used, size, acknowledged=acknowledged)
             return np.asarray(arrived[0])
         self._charge(used[None], size, acknowledged=acknowledged)
-        if self._n_drawn == 1:
+        if self._n_all_runs == 1:
             return used[None]
-        everywhere = np.broadcast_to(used, (self._n_drawn, used.size))
-        return np.asarray(everywhere[self._drawn])
+        everywhere = np.broadcast_to(used, (self._n_all_runs, used.size))
+        return np.asarray(everywhere[self._own_runs])
 
     def _transmit_rounds(
         self, count: int, used: Mask, size: _Size, *, acknowledged: bool
@@ -507,14 +534,15 @@ class Channel:
         # A graph without links has no rounds, so that their number does not grow.
         step = 1 if graph.senders.size else 0
         rounds = [first + k * step for k in range(count)]
-        # Radios that are off send nothing, which costs nothing.
-        on = [self.faults.active_links(graph, round_, self.t) for round_ in rounds]
-        used_by_round = used & np.array(on)
+        # Silent agents send nothing, which costs nothing.
+        active = [self.faults.active_links(graph, round_, self.t) for round_ in rounds]
+        used_by_round = used & np.array(active)
         draws = self.faults.draw_rounds(
-            graph, range(first, first + count), self._n_drawn, self.t
+            graph, range(first, first + count), self._n_all_runs, self.t
         )
-        arrived = used_by_round[:, None] & ~draws[:, self._drawn]
-        # The ledger has the mean over the runs, and the sum over rounds one after the other.
+        arrived = used_by_round[:, None] & ~draws[:, self._own_runs]
+        # The ledger counts losses as the mean over the runs. Rounds are added one after the other,
+        # so that a block of rounds gives the same floating-point sum as single ones.
         missing = (used_by_round[:, None] & ~arrived).mean(axis=1)
         lost = self.ledger.lost
         for row in missing:
@@ -526,14 +554,14 @@ class Channel:
     def _count_by_agent(
         self, agents: Indices, weights: Array | None = None
     ) -> Counts | Array:
-        """Return how often each agent is named, or the sum of its weights."""
+        """Return how often each agent occurs in an array, or the sum of its weights, (A,)."""
         counts: Counts | Array = np.bincount(
             agents, weights, minlength=self.graph.n_agents
         )
         return counts
 
     def _charge_mixing(self) -> None:
-        """Enter rounds of mixing without faults, in which every link carries a message."""
+        """Add the waiting rounds of `_mix_without_faults` to the ledger; every link was used."""
         uncharged = self._uncharged
         self._uncharged = {}
         every_link = np.ones((1, self.graph.senders.size), dtype=bool)
@@ -548,12 +576,24 @@ class Channel:
         acknowledged: bool = False,
         repeated: int = 1,
     ) -> None:
-        """Enter the messages on links (rounds, E) of these sizes, some times, in both bills."""
+        """Add messages to the ledger: per link, and per transmission to all receivers at once.
+
+        Parameters
+        ----------
+        used_by_round : ndarray of bool, (rounds, E)
+            The links that carry a message.
+        size : _Size
+            Scalars and bytes of a message.
+        acknowledged : bool
+            Add an acknowledgement of one byte for each message, to its receiver.
+        repeated : int
+            How often the rounds took place.
+        """
         graph = self.graph
-        # Rounds that are entered later only add to it.
+        # Not `self.ledger`, which would first add the rounds that are not yet in it.
         ledger = self._ledger
         totals: dict[str, object] = {}
-        # Without links there is no round.
+        # A graph without links has no rounds.
         if graph.senders.size:
             totals["rounds"] = ledger.rounds + repeated * len(used_by_round)
         bills = self._count_bills(used_by_round, size, acknowledged, repeated)
@@ -564,7 +604,10 @@ class Channel:
     def _count_bills(
         self, used_by_round: Mask, size: _Size, acknowledged: bool, repeated: int
     ) -> list[Counts]:
-        """Return what each agent sends, in the order of the ledger's fields."""
+        """Return messages, scalars and bytes of each agent per link, then per transmission.
+
+        That is the order of the ledger's fields in `_BILLS`.
+        """
         graph = self.graph
         if size.is_common and size.transmission is not None and not acknowledged:
             # The usual case: an agent sends the same on all its links, or on those in use.
@@ -580,7 +623,7 @@ class Channel:
             scalars, bytes_ = size.transmission
             links_bill = [messages, messages * scalars, messages * bytes_]
             return [*links_bill, sends, sends * scalars, sends * bytes_]
-        # How often each link, and each agent for all its links at once, has sent.
+        # How often each link was used.
         uses = repeated * used_by_round.sum(axis=0)
         by_link: list[Counts | Array] = []
         for weights in (uses, uses * size.scalars, uses * size.bytes):
@@ -591,9 +634,10 @@ class Channel:
             by_agent = [sends, *[sends * part for part in size.transmission]]
         amounts = [np.asarray(n, dtype=np.int64) for n in (*by_link, *by_agent)]
         if acknowledged:
-            # One byte back for each message, in the same round.
+            # One byte back for each message: messages and bytes of both bills grow.
             replies = np.asarray(self._count_by_agent(graph.receivers, uses), np.int64)
-            for k in (0, 2, 3, 5):
+            for name in ("messages", "bytes", "transmissions", "broadcast_bytes"):
+                k = _BILLS.index(name)
                 amounts[k] = amounts[k] + replies
         return amounts
 
@@ -676,7 +720,7 @@ def _copy_part(part: object, agent: int, runs: tuple[int, ...]) -> Part:
 
 
 def _count_present(part: Part, n_runs: int) -> int:
-    """Return how many entries of one run are not NaN in all runs."""
+    """Return the number of entries of a run, except those that are NaN in every run."""
     present = ~np.isnan(part).reshape(n_runs, -1)
     return int(present.any(axis=0).sum())
 
@@ -702,8 +746,7 @@ def _group_by_receiver(
 ) -> list[dict[int, P]]:
     """Return for each agent the messages on some links, ascending numbers, by sender."""
     senders = graph.senders[links].tolist()
-    # Links are ordered by receiver: agent i has those from bounds[i] to before bounds[i
-    # + 1].
+    # Links are ordered by receiver: agent i has those from bounds[i] to before bounds[i + 1].
     agents = np.arange(graph.n_agents + 1)
     bounds = np.searchsorted(graph.receivers[links], agents).tolist()
     inbox = []
@@ -715,7 +758,10 @@ def _group_by_receiver(
 def _weights_after_loss(
     graph: Graph, weights: ConsensusWeights, arrived: Mask, on_loss: LossRule
 ) -> tuple[Array, Array]:
-    """Return self-weights (R, A) and link weights (R, E) of each run after losses."""
+    """Return self-weights (R, A) and link weights (R, E) of each run after losses.
+
+    `arrived` (R, E) says which links have delivered; the rules are those of :meth:`Channel.mix`.
+    """
     receivers = graph.receivers
     sum_links = partial(graph._sum_by_receiver, axis=1)
     if on_loss in ("mutual", "metropolis"):
@@ -737,6 +783,7 @@ def _weights_after_loss(
         self_weights = self_weights + sum_links(weights.link_weights * ~arrived)
     elif on_loss == "renormalise":
         total = self_weights + sum_links(link_weights)
+        # Weights are of the size of one, so that a smaller sum is zero but for rounding.
         if (np.abs(total) < 1e-12).any():
             raise ValueError(
                 "on_loss must not be 'renormalise' where the weights of received messages "

@@ -13,12 +13,13 @@ from typing import Annotated
 
 import numpy as np
 
-from ..linalg import SolverError
+from ..linalg import EPS, SolverError
 from ..validation import (
     Array,
     ArrayInput,
     FrozenModel,
     Indices,
+    Mask,
     PositiveFloat,
     PositiveInt,
     call_user,
@@ -66,7 +67,7 @@ def _warn_if_disconnected(channel: Channel, rounds: int | None = None) -> None:
         return
     graph = channel.graph
     silent = channel.faults.always_silent
-    components = _components(graph, silent) if silent else graph.components
+    components = _find_components(graph, silent) if silent else graph.components
     count = int(components.max()) + 1
     if count > 1:
         because = f" with agents {sorted(silent)} silent" if silent else ""
@@ -74,26 +75,32 @@ def _warn_if_disconnected(channel: Channel, rounds: int | None = None) -> None:
             "channel must have a connected graph to reach one average, "
             f"got {count} components{because}, each of which reaches its own",
             Disconnected,
-            # Over the rule and its validation to the rule's caller.
+            # The warning points at the call of the rule, above the rule and its validation.
             stacklevel=4,
         )
 
 
 @lru_cache(maxsize=32)
-def _components(graph: Graph, silent: frozenset[int]) -> Indices:
-    """Return the strongly connected components that remain without some agents' links, (A,)."""
-    off = np.isin(np.arange(graph.n_agents), list(silent))
-    on_links = ~(off[graph.receivers] | off[graph.senders])
-    pairs = np.stack([graph.receivers[on_links], graph.senders[on_links]], axis=1)
+def _find_components(graph: Graph, silent: frozenset[int]) -> Indices:
+    """Return each agent's strongly connected component, (A,), without the silent agents' links.
+
+    An agent without links is a component by itself.
+    """
+    is_silent = np.isin(np.arange(graph.n_agents), list(silent))
+    # A link works if neither of its ends is silent.
+    works = ~(is_silent[graph.receivers] | is_silent[graph.senders])
+    pairs = np.stack([graph.receivers[works], graph.senders[works]], axis=1)
     return Graph.from_edges(graph.n_agents, pairs, directed=True).components
 
 
 def _check_single_run(channel: Channel) -> None:
+    """Refuse a batch of runs, in which an agent would send other messages in each run."""
     if channel.runs:
         raise ValueError(f"channel must be a single run, got runs {channel.runs}")
 
 
 def _check_faultless(channel: Channel) -> None:
+    """Refuse a channel that loses or delays messages, or has silent agents."""
     if not channel.faults.is_perfect:
         raise ValueError("channel must have no faults here, got a channel with faults")
 
@@ -208,16 +215,28 @@ def finite_time_consensus(values: PerAgent, channel: Channel) -> Array:
     return np.asarray(mixed)
 
 
+_EXACT = 1e-9
+"""Largest error of an average of numbers of size one that still passes for exact."""
+
+_EQUAL = 1e-9
+"""Eigenvalues closer than this, relative to the largest, are one: they differ by rounding."""
+
+
 @lru_cache(maxsize=32)
 def _order_eigenvalues(graph: Graph) -> list[float]:
-    """Return the distinct nonzero eigenvalues in Leja's order, if rounding permits."""
+    """Return the Laplacian's distinct nonzero eigenvalues in Leja's order.
+
+    Refuse a graph for which rounding spoils the product of the factors I - L/λ.
+    """
+    # The smallest eigenvalue is the zero of the average.
     eigenvalues = _leja_order(_drop_repeated(graph.laplacian_spectrum[1:]))
-    # Applied to I - 11ᵀ/A the product is zero, but for rounding.
+    # The columns of I - 11ᵀ/A are differences from the average. The product of all factors takes
+    # them to zero, and the remainder is the rounding error.
     remainder = np.eye(graph.n_agents) - 1 / graph.n_agents
     for eigenvalue in eigenvalues:
         remainder -= graph.laplacian @ remainder / eigenvalue
     error = np.abs(remainder).max()
-    if error > 1e-9:
+    if error > _EXACT:
         raise ValueError(
             "channel must have a graph whose Laplacian's eigenvalues permit an exact average in "
             f"floating point, got a rounding error of {error:.0e}: use average_consensus"
@@ -228,20 +247,24 @@ def _order_eigenvalues(graph: Graph) -> list[float]:
 def _drop_repeated(ascending: Array) -> Array:
     """Return ascending values without those that repeat the one before up to rounding."""
     scale = max(1.0, float(ascending.max(initial=0)))
-    is_new = np.diff(ascending, prepend=-np.inf) > 1e-9 * scale
+    # The first value has nothing before it, and is new.
+    is_new = np.diff(ascending, prepend=-np.inf) > _EQUAL * scale
     return ascending[is_new]
 
 
 def _leja_order(ascending: Array) -> list[float]:
-    """Return ascending points in an order in which partial products of their factors stay small.
+    """Return ascending points in Leja's order, in which products of factors 1 - x/λ stay small.
 
-    The first is the largest; each next one is farthest, in the geometric mean, from all
-    before it.
+    The first point is the largest. The next one p has the largest product of distances
+    Π |p - p_k| from the points p_k before it. D. Calvetti and L. Reichel, Journal of Computational
+    and Applied Mathematics 71 (1996) 267-286.
     """
+    # log Π |p - p_k| of every point p
     log_distance = np.zeros(ascending.size)
     order = [float(p) for p in ascending[-1:]]
     while len(order) < ascending.size:
-        # Points that are in the order already have the logarithm of zero.
+        # A point that is in the order already has the distance zero, whose logarithm is -inf, and
+        # is not chosen again.
         with np.errstate(divide="ignore"):
             log_distance += np.log(np.abs(ascending - order[-1]))
         order.append(float(ascending[log_distance.argmax()]))
@@ -261,14 +284,19 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: PositiveInt) -> Arra
     Parameters
     ----------
     values, channel
-        As for :func:`average_consensus`. Strongly connected; messages may be lost.
+        As for :func:`average_consensus`. Strongly connected; messages may be lost. If an
+        agent is always silent, its neighbours go on pushing to it in vain. The others then
+        agree on a weighted mean of their values, and a :class:`Disconnected` warning
+        says so.
     rounds : int
         Number of rounds, with k + 1 scalars a link each.
 
     Returns
     -------
     ndarray, (*runs, A, k)
-        The ratios.
+        The ratios. While agents are cut off, weights shrink in each round. An agent whose
+        weight vanishes in rounding keeps its last ratio; if it still does so at the end,
+        a :class:`Disconnected` warning names it.
 
     Notes
     -----
@@ -284,6 +312,7 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: PositiveInt) -> Arra
     """
     graph = channel.graph
     graph._check_connected()
+    _warn_if_disconnected(channel, rounds)
     # Value and weight of each agent, which move together.
     ones = np.ones((*values.shape[:-1], 1))
     mass = np.concatenate([values, ones], axis=-1)
@@ -292,18 +321,70 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: PositiveInt) -> Arra
     pushed = np.zeros_like(mass)
     # The last running sum that arrived on each link.
     received = np.zeros((*channel.runs, graph.senders.size, mass.shape[-1]))
+    # All weight that has arrived at each agent, and a bound of its own weight's rounding error.
+    total = np.zeros_like(ones)
+    rounding = np.zeros_like(ones)
+    last_usable = mass
     for _ in range(rounds):
         pushed = pushed + part * mass
         arrived = channel.send_on_links(
             pushed[..., graph.senders, :], is_broadcast=True
         )
-        # Where a message is lost the last sum stays, and the next one brings both
-        # increases.
+        # Where a message is lost the last sum stays; the next one brings both increases.
         latest = np.where(np.isnan(arrived), received, arrived)
-        mass = part * mass + graph._sum_by_receiver(latest - received)
+        increase = graph._sum_by_receiver(latest - received)
+        mass = part * mass + increase
         received = latest
+        # An increase is a difference of running sums, with an error of ε times their size.
+        weight_increase = increase[..., -1:]
+        total = total + weight_increase
+        rounding = part * rounding + np.where(weight_increase > 0, EPS * total, 0.0)
+        # An agent whose weight is lost in rounding keeps the value and weight that it had before.
+        usable = _is_usable(mass[..., -1:], rounding)
+        is_usual = np.count_nonzero(usable) == usable.size
+        last_usable = mass if is_usual else np.where(usable, mass, last_usable)
+    _warn_if_weights_vanish(usable)
     # The ratio of value and weight is the estimate of the average.
-    return np.asarray(mass[..., :-1] / mass[..., -1:])
+    return np.asarray(last_usable[..., :-1] / last_usable[..., -1:])
+
+
+_RATIO_ERROR = 1e-6
+"""Relative error that rounding may cause in a ratio of push-sum: six digits stay right."""
+
+_LEAST_WEIGHT = float(np.sqrt(np.finfo(float).tiny))
+"""Weights of push-sum above this, 1e-154, have products with values that do not underflow."""
+
+
+def _is_usable(weight: Array, rounding: Array) -> Mask:
+    """Return which weights of push-sum are more than rounding errors, (*runs, A, 1).
+
+    Weights shrink while agents are cut off. Such an agent has its weight multiplied by
+    1 / (1 + its receivers) in every round, until it underflows. Its neighbours' weight drains
+    into the links that are down, while the running sums do not shrink, nor do their errors.
+
+    Parameters
+    ----------
+    weight, rounding : ndarray, (*runs, A, 1)
+        The agents' weights after a round, and bounds of their rounding errors.
+    """
+    is_precise = rounding < _RATIO_ERROR * weight
+    return np.asarray(is_precise & (weight > _LEAST_WEIGHT))
+
+
+def _warn_if_weights_vanish(usable: Mask) -> None:
+    """Warn of agents that keep an old ratio of push-sum in any run, from (*runs, A, 1)."""
+    n_agents = usable.shape[-2]
+    in_all_runs = usable.reshape(-1, n_agents).all(axis=0)
+    if not in_all_runs.all():
+        agents = np.flatnonzero(~in_all_runs).tolist()
+        warnings.warn(
+            "channel must deliver some messages between all parts of the graph for push_sum, "
+            f"got weights of agents {agents} that vanish in rounding: these agents keep "
+            "their ratio of an earlier round",
+            Disconnected,
+            # The warning points at the call of push_sum, above it and its validation.
+            stacklevel=4,
+        )
 
 
 @fusion_rule("vectors")
@@ -313,12 +394,15 @@ def max_consensus(
 ) -> Array:
     """Reach the largest value, component by component, in as many rounds as the diameter.
 
+    In each round an agent keeps the largest of its own value and those that it receives.
+
     Parameters
     ----------
     values, channel
-        As for :func:`average_consensus`. Connected; a lost message only costs time.
+        As for :func:`average_consensus`. The graph has to be connected. A lost message makes no
+        value wrong, it only delays the largest one: pass more rounds then.
     rounds : int, optional
-        By default the graph's diameter.
+        By default the graph's diameter, which is enough without losses.
 
     Examples
     --------
@@ -331,14 +415,14 @@ def max_consensus(
     largest = values.copy()
     if graph.n_agents == 1:
         return np.asarray(largest)
-    # Links are ordered by receiver, and each agent of a connected graph has one or
-    # more.
+    # Links are ordered by receiver: those to agent i begin at indptr[i]. In a connected graph
+    # every agent has at least one, which `reduceat` needs.
     row_starts = graph.links.indptr[:-1]
     for _ in range(rounds or graph.diameter):
         arrived = channel.send_on_links(
             largest[..., graph.senders, :], is_broadcast=True
         )
-        # fmax passes over NaN, a lost message.
+        # A lost message is NaN, which fmax ignores.
         received = np.fmax.reduceat(arrived, row_starts, axis=-2)
         largest = np.fmax(largest, received)
     return np.asarray(largest)
@@ -441,14 +525,14 @@ def admm(
     w = np.zeros_like(start)
     for iteration in range(1, iterations + 1):
         u = check_array(call_user(local_solve, z - w, rho), "local_solve", z.shape)
-        new = check_array(call_user(average, u + w, channel), "average", z.shape)
-        # W is the scaled dual variable.
-        w = w + u - new
-        # Each agent's primal residual |U - Z| and dual residual ρ |Z - Z before|.
-        local = np.abs(u - new).max(axis=1)
-        change = rho * np.abs(new - z).max(axis=1)
-        residuals = np.stack([local, change], axis=1)
-        z = new
+        new_z = check_array(call_user(average, u + w, channel), "average", z.shape)
+        # W is the dual variable divided by ρ.
+        w = w + u - new_z
+        # Each agent's primal residual |U - Z| and dual residual ρ |Z - Z before|, (A,).
+        primal_by_agent = np.abs(u - new_z).max(axis=1)
+        dual_by_agent = rho * np.abs(new_z - z).max(axis=1)
+        residuals = np.stack([primal_by_agent, dual_by_agent], axis=1)
+        z = new_z
         # After the maximum all agents hold the same two numbers; any row will do.
         primal, dual = max_consensus(residuals, channel)[0].tolist()
         if primal < tolerance and dual < tolerance:

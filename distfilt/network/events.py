@@ -75,8 +75,7 @@ def event_triggered(
     x = values
     link_weights = metropolis(graph).link_weights[:, None]
     faulty = not channel.faults.is_perfect
-    # The value that each link delivered last; its sender knows it by the
-    # acknowledgement.
+    # The value that each link delivered last. Its sender knows it too, by acknowledgements.
     delivered = np.full((graph.senders.size, x.shape[1]), np.nan)
     for _ in range(rounds):
         present = x[graph.senders]

@@ -110,9 +110,9 @@ class Faults(FrozenModel):
     def __post_init__(self) -> None:
         super().__post_init__()
         loss = np.asarray(self.loss)
-        # Independent losses repeat with probability p: runs of them last 1 / (1 - p) on
-        # average.
+        # With independent losses of probability p, a burst lasts 1 / (1 - p) rounds on average.
         shortest = 1 / (1 - loss[loss < 1].max(initial=0.0))
+        # A caller may compute the limit itself, and round it to the other side.
         if self.burst_length is not None and self.burst_length < shortest * (1 - 1e-9):
             raise ValueError(
                 f"burst_length must be at least 1 / (1 - loss) = {shortest:g} rounds, the mean "
@@ -141,17 +141,20 @@ class Faults(FrozenModel):
         return tuple(flat)
 
     def _seeds_of_losses(self) -> set[int]:
+        """Return the seeds of all faults that lose messages."""
         return {faults.seed for faults in self._flatten() if np.any(faults.loss)}
 
     def check_graph(self, graph: Graph) -> None:
-        """Refuse a graph of which the agents do not fit."""
+        """Refuse a graph with another number of agents than `loss` has, or without a silent one."""
         n_agents = graph.n_agents
         for faults in self._flatten():
+            # One number, one for each agent, or one for each pair.
             shape = np.shape(faults.loss)
             if shape != (n_agents,) * len(shape):
                 raise ValueError(
                     f"loss must be a number for each of {n_agents} agents, got {shape}"
                 )
+            # Agents are numbered from 0; -1 passes where none is silent.
             Bounds(below=n_agents)(max(faults.silent, default=-1), "silent")
 
     @cached_property
@@ -196,9 +199,10 @@ class Faults(FrozenModel):
     def draw_rounds(
         self, graph: Graph, rounds: range, runs: int, t: float | None = None
     ) -> Mask:
-        """Return the losses of some rounds one after the other, (rounds, runs, E).
+        """Return which links lose their message in each of some successive rounds.
 
-        Those of :meth:`draw_losses`, for a fraction of the time a round.
+        The result (rounds, runs, E) has the losses of :meth:`draw_losses` for each round; drawn
+        together they cost less time.
         """
         lost = np.zeros((len(rounds), runs, graph.senders.size), dtype=bool)
         for faults in self._flatten():
@@ -218,29 +222,31 @@ class Faults(FrozenModel):
         return any(start <= now < stop for start, stop in self.during)
 
     def _draw_rounds(self, graph: Graph, rounds: range, runs: int) -> Mask:
-        """Return the losses of some rounds, (rounds, runs, E), whatever the window."""
+        """Return the losses of some rounds, (rounds, runs, E), as if `during` were always."""
         probability = self._link_probabilities(graph)
         link_bits = _link_bits(graph)
         uniform = _uniform(self._run_bits(rounds, runs)[:, :, None] ^ link_bits)
         if self.burst_length is None:
             return np.asarray(uniform < probability)
 
-        # Gilbert's chain. A link that fails goes on with probability 1 - 1/burst_length
-        # = enter + stay; one that works fails next with probability enter. Its
-        # stationary probability of failing is then enter / (1 - stay) = loss.
+        # Gilbert's two-state Markov chain. A failing link fails again with probability
+        # enter + stay = 1 - 1/burst_length; a working one fails next with probability enter. The
+        # stationary probability of failing is then enter / (1 - stay) = loss. Both equations give
+        # stay = 1 - 1 / (burst_length (1 - loss)), clipped at zero for rounding. A link that always
+        # or never fails has no bursts.
         probability = np.broadcast_to(probability, link_bits.shape)
-        random = (probability > 0) & (probability < 1)
-        works = np.where(random, 1 - probability, 1.0)
-        stay = np.where(random, 1 - 1 / (self.burst_length * works), 0.0).clip(0)
+        is_random = (probability > 0) & (probability < 1)
+        success = np.where(is_random, 1 - probability, 1.0)
+        stay = np.where(is_random, 1 - 1 / (self.burst_length * success), 0.0).clip(0)
         enter = probability * (1 - stay)
-        # u < enter: lost. enter <= u < enter + stay: as in the round before. Else it
-        # arrives.
+        # u < enter: lost; enter <= u < enter + stay: as in the round before; otherwise it arrives.
         lost = uniform < enter
-        goes_on = ~lost & (uniform < enter + stay)
-        unknown = np.nonzero(goes_on[0])
+        repeats = ~lost & (uniform < enter + stay)
+        # The first round repeats one that is not among these: it is looked up.
+        unknown = np.nonzero(repeats[0])
         self._look_back(lost[0], unknown, rounds[0], link_bits, enter, stay)
         for k in range(1, len(rounds)):
-            lost[k] |= goes_on[k] & lost[k - 1]
+            lost[k] |= repeats[k] & lost[k - 1]
         return np.asarray(lost)
 
     def _look_back(
@@ -252,7 +258,24 @@ class Faults(FrozenModel):
         enter: Array,
         stay: Array,
     ) -> None:
-        """Fill in losses that are those of an earlier round, in place."""
+        """Fill in, in place, the losses that repeat those of an earlier round.
+
+        A round whose number u lies outside [enter, enter + stay) decides by itself whether a link
+        fails. The losses that are asked for are those of the latest such round before `round_`.
+
+        Parameters
+        ----------
+        lost : ndarray of bool, (runs, E)
+            The losses of round `round_`, of which the unknown ones are filled in.
+        unknown : tuple of ndarray
+            The runs and the links of the unknown losses, each (n,).
+        round_ : int
+            Number of the round.
+        link_bits : ndarray of uint64, (E,)
+            Random bits of the links, by `_link_bits`.
+        enter, stay : ndarray, (E,)
+            The probabilities of Gilbert's chain, as in `_draw_rounds`.
+        """
         run, link = unknown
         runs = lost.shape[0]
         while run.size:
@@ -261,14 +284,14 @@ class Faults(FrozenModel):
             uniform = _uniform(self._run_bits(earlier, runs)[:, run] ^ link_bits[link])
             fails = uniform < enter[link]
             decided = fails | (uniform >= (enter + stay)[link])
-            # The latest round that decides; argmax finds the first True, or 0 where
-            # there is none.
+            # The first row that decides is the latest round: rows go back in time. Where none
+            # does, argmax is 0, and the loss is overwritten in the next pass.
             latest = decided.argmax(axis=0)
             lost[run, link] = fails[latest, np.arange(run.size)]
-            # The others go on from an earlier round.
-            open_ = ~decided.any(axis=0)
-            run = run[open_]
-            link = link[open_]
+            # These repeat a round that is earlier still.
+            is_undecided = ~decided.any(axis=0)
+            run = run[is_undecided]
+            link = link[is_undecided]
 
     def _link_probabilities(self, graph: Graph) -> Array:
         """Return the probability of loss of each link, (E,), or one number for all."""
@@ -278,14 +301,21 @@ class Faults(FrozenModel):
         return loss[graph.receivers] if loss.ndim == 1 else loss
 
     def _run_bits(self, rounds: Sequence[int], runs: int) -> Hashes:
-        """Return random bits for each round and run, (rounds, runs)."""
+        """Return random bits for each round and run, (rounds, runs): hashes of seed, round and run.
+
+        Entry k of the generator splitmix64 is the hash of seed + (k + 1) `_GOLDEN`, so that any
+        round's bits are computed without those before it.
+        """
         keys = [(self.seed + _GOLDEN * (k + 1)) % 2**64 for k in rounds]
         numbers = np.arange(runs, dtype=np.uint64) * np.uint64(_GOLDEN)
         return _mix_bits(_mix_bits(keys)[:, None] ^ numbers)
 
 
 def _check_windows(during: object) -> tuple[tuple[float, float], ...]:
-    """Return windows as pairs of numbers."""
+    """Return the argument `during` as pairs (start, stop) of rounds or times.
+
+    An end may be infinite; a NaN fails the comparison and is refused.
+    """
     ends = check_array(during, "during", finite=False)
     if ends.ndim != 2 or ends.shape[1] != 2 or not (ends[:, 0] < ends[:, 1]).all():
         raise ValueError(

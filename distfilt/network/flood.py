@@ -68,25 +68,26 @@ def flooding(
     known = np.eye(n_agents, dtype=bool)
     new = known
     opposite = find_opposite(graph)
-    # Which values have come over which link; the last row stands for no link at all.
-    came = np.zeros((graph.senders.size + 1, n_agents), dtype=bool)
+    # Which values (columns) have come over which link (rows). The additional last row, always
+    # false, serves links without an opposite.
+    came_over = np.zeros((graph.senders.size + 1, n_agents), dtype=bool)
     # A value travels over at most A - 1 links, so that the default is never reached.
     rounds_left = rounds or 2 * n_agents
     while new.any() and rounds_left:
         rounds_left -= 1
         outgoing = new[graph.senders]
         if split_horizon:
-            outgoing = outgoing & ~came[opposite]
-        # One transmission for all receivers holds the values that any of them needs.
-        needed = np.zeros_like(known)
-        np.logical_or.at(needed, graph.senders, outgoing)
+            outgoing = outgoing & ~came_over[opposite]
+        # By broadcast an agent sends each value once that it sends on any of its links.
+        on_any_link = np.zeros_like(known)
+        np.logical_or.at(on_any_link, graph.senders, outgoing)
         payloads = [table[rows] if rows.any() else None for rows in outgoing]
-        common = [table[rows] if rows.any() else None for rows in needed]
+        common = [table[rows] if rows.any() else None for rows in on_any_link]
         received = np.zeros_like(known)
         for link, rows in enumerate(channel.unicast(payloads, common=common)):
             if rows is not None:
-                came[link, rows[:, 0].astype(int)] = True
-                received[graph.receivers[link]] |= came[link]
+                came_over[link, rows[:, 0].astype(int)] = True
+                received[graph.receivers[link]] |= came_over[link]
         # Only first receptions are forwarded in the next round.
         new = received & ~known
         known = known | new
@@ -95,7 +96,7 @@ def flooding(
 
 
 def find_opposite(graph: Graph) -> Indices:
-    """Return the number of each link's opposite link; that of the last one and 1 if none is."""
+    """Return the number of each link's opposite link; the number of links where there is none."""
     ends = list(zip(graph.receivers.tolist(), graph.senders.tolist(), strict=True))
     numbers = {pair: link for link, pair in enumerate(ends)}
     opposite = [numbers.get((sender, agent), len(ends)) for agent, sender in ends]

@@ -70,7 +70,7 @@ Gaussians = tuple[
 ]
 Ensembles = Annotated[ArrayInput, "*channel.runs channel.graph.n_agents N d"]
 Pair = tuple[Array, Array]
-"""Means and covariances, or self-weights and link weights."""
+"""Means (*runs, A, d) and covariances; or self-weights (R, A) and link weights (R, E)."""
 
 Rule = Literal["equal", "trace", "determinant", "min_trace", "min_determinant"]
 
@@ -131,7 +131,10 @@ def covariance_intersection(
 def _intersect(
     belief: Pair, channel: Channel, rule: Rule, rounds: int, periods: Periods
 ) -> Pair:
-    """Fuse Gaussians with these periods by covariance intersection, without checks."""
+    """Fuse Gaussians by covariance intersection, without checks.
+
+    `periods` has an entry for each component of the belief; () if none is circular.
+    """
 
     def fuse(received: _Received) -> Pair:
         if len(periods) == received.means.shape[-1]:
@@ -203,8 +206,8 @@ def arithmetic_average(
         self_weights, link_weights = _intersection_weights(received, "equal")
         difference = received.mean_differences()
         shift = graph._sum_by_receiver(link_weights[..., None] * difference, 1)
-        # From the new mean the own one lies at -shift, a received one at
-        # difference - shift.
+        # The new mean is m = m_i + s with the shift s = Σ_j ω_j (m_j - m_i). The own mean lies at
+        # -s from it, a received one at (m_j - m_i) - s.
         deviation = difference - shift[:, graph.receivers]
         weighted = link_weights[..., None, None] * deviation[..., :, None]
         spread = graph._sum_by_receiver(weighted * deviation[..., None, :], 1)
@@ -330,8 +333,8 @@ def mean_pull(
             new_means, self_weights = _mix_circular(means, channel, weights)
         else:
             new_means, self_weights = channel._mix_once(means, weights, "keep")
-        # All members get the same shift of the mean, and their deviations the factor 1
-        # - γ |Nbs|.
+        # x_i + γ Σ (m_j - x_i) is the mixed mean plus (1 - γ |Nbs|) times the member's deviation
+        # from the own mean. The self-weight is 1 - γ times the number of means that arrived.
         factor = (self_weights - gain * include_self)[..., None, None]
         deviations = pulled - means[..., None, :]
         pulled = new_means[..., None, :] + factor * deviations
@@ -421,7 +424,7 @@ def _find_known(means: Array, covs: Array) -> Mask:
     Traceback (most recent call last):
     ValueError: ensembles must have equal means where no agent has a variance, got means ...
     """
-    # Members that are all equal vary by rounding alone.
+    # Members that are all equal vary by rounding alone: by a few units of it, from the sum.
     rounding = 16 * EPS * np.abs(means)
     is_known = np.diagonal(covs, axis1=-2, axis2=-1) <= rounding**2
     by_component = np.asarray(is_known.reshape(-1, means.shape[-1]).all(axis=0))
@@ -464,12 +467,15 @@ def _mix_circular(
 
 @dataclass(eq=False)
 class _Received:
-    """Gaussians of one round, with runs in one axis, and the links (R, E) on which they arrived."""
+    """Gaussians of all agents in one round, and which of them have arrived. Runs are one axis."""
 
     graph: Graph
     means: Array
+    """Each agent's mean, (R, A, d)."""
     covs: Array
+    """Each agent's covariance, (R, A, d, d)."""
     arrived: Mask
+    """Whether the sender's Gaussian has arrived on each link, (R, E)."""
     periods: Periods = ()
 
     def sum_matrices(
@@ -495,7 +501,11 @@ class _Received:
 def _repeat(
     belief: Pair, channel: Channel, rounds: int, fuse: Callable[[_Received], Pair]
 ) -> Pair:
-    """Exchange means and upper triangles of covariances and fuse them, some times."""
+    """Exchange means and upper triangles of covariances, and fuse them, in so many rounds.
+
+    `fuse` takes the Gaussians of an exchange, and returns the new means and covariances of all
+    agents with runs in one axis, (R, A, d) and (R, A, d, d).
+    """
     means, covs = belief
     is_uncertain = _find_uncertain(covs)
     if np.count_nonzero(is_uncertain) < is_uncertain.size:
@@ -510,7 +520,10 @@ def _repeat_uncertain(
     fuse: Callable[[_Received], Pair],
     is_uncertain: Mask,
 ) -> Pair:
-    """Fuse the components that have a variance; the others are constants known to all."""
+    """Do as `_repeat` with the components that have a variance; the others are known constants.
+
+    `is_uncertain` (d,) says which components those are.
+    """
     means, covs = belief
     known = means[..., ~is_uncertain]
     if (known != known[..., :1, :]).any():
@@ -529,10 +542,10 @@ def _repeat_uncertain(
     return new_means, new_covs
 
 
-def _select_periods(periods: Periods, is_uncertain: Mask) -> Periods:
-    """Return the periods of some components."""
-    chosen = zip(periods, is_uncertain.tolist(), strict=True) if periods else ()
-    return tuple([period for period, is_chosen in chosen if is_chosen])
+def _select_periods(periods: Periods, is_chosen: Mask) -> Periods:
+    """Return the periods of the chosen components, of (d,) in all; () stays ()."""
+    pairs = zip(periods, is_chosen.tolist(), strict=True) if periods else ()
+    return tuple([period for period, chosen in pairs if chosen])
 
 
 def _repeat_all(
@@ -542,7 +555,7 @@ def _repeat_all(
     fuse: Callable[[_Received], Pair],
     periods: Periods,
 ) -> Pair:
-    """Exchange and fuse Gaussians all of whose components have a variance, some times."""
+    """Do as `_repeat` with Gaussians all of whose components have a variance."""
     means, covs = belief
     graph = channel.graph
     d = means.shape[-1]
@@ -568,9 +581,9 @@ def _intersection_weights(received: _Received, rule: Rule) -> Pair:
         total = size + graph.in_degree
         return size / total, 1 / total[:, graph.receivers]
     if rule != "equal":
-        # Weights are proportional to a size of each covariance: its weight against a
-        # unit covariance, over that one's. No agent's number depends on another's in
-        # any digit.
+        # Weights are proportional to a size of each covariance, such as 1 / trace: its weight
+        # against a unit covariance, divided by that one's. Computed against the unit and not
+        # against the other agents' covariances, it has the same digits at every agent.
         unit = np.eye(received.means.shape[-1])
         units = np.broadcast_to(unit, received.covs.shape)
         pairs = np.stack([received.covs, units], axis=-3)

@@ -77,11 +77,11 @@ def gossip_consensus(
     agents = rng.integers(graph.n_agents, size=rounds)
     choices = (rng.random(rounds) * graph.in_degree[agents]).astype(np.int64)
     faulty = not channel.faults.is_perfect
-    # Both are reused: only the two links of the present pair are in use.
+    # These two arrays serve all rounds; in each only the two links of its pair are filled in.
     packet = np.zeros((*channel.runs, graph.senders.size, averaged.shape[-1]))
     in_use = np.zeros(graph.senders.size, dtype=bool)
     for agent, choice in zip(agents.tolist(), choices.tolist(), strict=True):
-        # An agent without neighbours spends its round.
+        # If the agent has no neighbours nothing happens in this round.
         if graph.in_degree[agent] == 0:
             continue
         link = int(graph.links.indptr[agent]) + choice
@@ -92,7 +92,7 @@ def gossip_consensus(
         arrived = channel.send_on_links(packet, links=in_use, acknowledged=faulty)
         in_use[pair] = False
         received = arrived[..., pair, :]
-        # Only if both messages have arrived, or the average would change.
+        # Both agents move only if both messages have arrived; otherwise the average would change.
         complete = ~np.isnan(received).any(axis=(-2, -1), keepdims=True)
         present = averaged[..., ends, :]
         mean = 0.5 * (present + received)

@@ -163,8 +163,8 @@ class Graph(FrozenModel):
     def reverse(self) -> Indices:
         """The number of the opposite link of each link, (E,), of an undirected graph."""
         self._check_undirected()
-        # Links are ordered by (receiver, sender); sorted by (sender, receiver) they are
-        # opposite.
+        # Links are ordered by (receiver, sender). In the order by (sender, receiver) entry e is
+        # the number of the link opposite to e.
         return np.lexsort((self.receivers, self.senders))
 
     @cached_property
@@ -249,12 +249,13 @@ class Graph(FrozenModel):
         if self.senders.size == 0:
             return float("inf")
         if self.is_directed:
-            # |1 - γλ| < 1 if and only if γ < 2 Re λ / |λ|²; the zero eigenvalue is the
-            # average's.
+            # |1 - γλ| < 1 if and only if γ < 2 Re λ / |λ|². The eigenvalue zero is left out: it
+            # belongs to the average, which stays.
             values = np.linalg.eigvals(self.laplacian.toarray())
             sizes = np.abs(values)
-            moving = sizes > 1e-9 * sizes.max()
-            bounds = 2 * values.real[moving] / sizes[moving] ** 2
+            # Rounding leaves about 1e-15 of the largest eigenvalue in place of zero.
+            is_nonzero = sizes > 1e-9 * sizes.max()
+            bounds = 2 * values.real[is_nonzero] / sizes[is_nonzero] ** 2
             return float(bounds.min(initial=np.inf))
         if self.n_agents <= _DENSE:
             return float(2 / self.laplacian_spectrum[-1])
@@ -264,7 +265,7 @@ class Graph(FrozenModel):
         """Return 2/λ_max by Lanczos iterations, or the bound if they do not converge."""
         from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
-        # A fixed start makes results repeatable; a random one is orthogonal to no
+        # A fixed seed makes results repeatable; a random vector has a part along every
         # eigenvector.
         start = np.random.default_rng(0).standard_normal(self.n_agents)
         try:

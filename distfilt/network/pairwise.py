@@ -62,9 +62,10 @@ def inverse_covariance_intersection(
 ) -> Pair:
     """Fuse each Gaussian with the neighbours', one by one, by inverse covariance intersection.
 
-    Less conservative than :func:`covariance_intersection`, and consistent if two agents' errors
-    are correlated by a common estimate to which each has added information of its own. See
-    :func:`distfilt.gaussians.intersect_inverses`.
+    Two covariances give P with P⁻¹ = P_a⁻¹ + P_b⁻¹ - (ω P_a + (1 - ω) P_b)⁻¹ and the weight ω of
+    the smallest P. Less conservative than :func:`covariance_intersection`, and consistent if two
+    agents' errors are correlated by a common estimate to which each has added information of its
+    own. See :func:`distfilt.gaussians.intersect_inverses`.
 
     Parameters
     ----------
@@ -104,9 +105,10 @@ def ellipsoidal_intersection(
 ) -> Pair:
     """Fuse each Gaussian with the neighbours', one by one, by ellipsoidal intersection.
 
-    All information that two agents could have in common counts once. The result is the least
-    conservative of the intersections, and no bound of the error for every correlation. Parameters
-    as for :func:`covariance_intersection`, without its rules; see
+    Two covariances give P with P⁻¹ = P_a⁻¹ + P_b⁻¹ - Γ⁻¹, where Γ⁻¹ is all information that both
+    could have in common, so that it counts once. The result is the least conservative of the
+    intersections, and no bound of the error for every correlation. Parameters as for
+    :func:`covariance_intersection`, without its rules; see
     :func:`distfilt.gaussians.intersect_ellipsoids`.
 
     >>> from distfilt.network import Channel, graphs
@@ -197,8 +199,8 @@ def split_covariance_intersection(
         dependent.reshape(*shape, d),
         independent.reshape(*shape, d),
     ]
-    for number in range(rounds):
-        if number:
+    for round_ in range(rounds):
+        if round_ > 0:
             # A part that has been sent is no longer independent.
             parts = [parts[0], parts[1] + parts[2], 0 * parts[2]]
         # A mean, and the upper triangles of two covariances
@@ -215,15 +217,21 @@ def split_covariance_intersection(
 def _fuse_parts(
     parts: list[Array], channel: Channel, arrived: Mask, rule: Size
 ) -> list[Array]:
-    """Fuse means and parts of covariances (R, A, ...) with those that have arrived."""
+    """Fuse each agent's Gaussian with those that have arrived, (R, E), one by one.
+
+    `parts` and the result are the means (R, A, d), and the dependent and the independent parts of
+    the covariances, (R, A, d, d).
+    """
     graph = channel.graph
     fused = [part.copy() for part in parts]
     for agents, links in _iterate_neighbours(graph):
+        # The agents' result so far, and their next neighbour's message
         own = [part[:, agents] for part in fused]
         other = [part[:, graph.senders[links]] for part in parts]
-        # On the receiver's branch of circular components
+        # The sender's mean on the receiver's branch of circular components
         other[0] = align(other[0], own[0], channel.periods)
         new = intersect_split(*own, *other, rule=rule)
+        # A lost message changes nothing.
         for part, value in zip(fused, new, strict=True):
             # Flags (R, agents) with as many axes as the part
             has_arrived = arrived[:, links].reshape(
@@ -234,9 +242,11 @@ def _fuse_parts(
 
 
 def _iterate_neighbours(graph: Graph) -> Iterator[tuple[Indices, Indices]]:
-    """Yield the agents that have a next neighbour, and the links from it, by sender."""
+    """Yield in turn n the agents that have an n-th neighbour, and their links from it.
+
+    Neighbours are ordered by number, from n = 0. All agents fuse their n-th one at once.
+    """
     for turn in range(int(graph.in_degree.max(initial=0))):
-        # All agents with so many neighbours fuse their next one together.
         agents = np.flatnonzero(graph.in_degree > turn)
         yield agents, graph.links.indptr[agents] + turn
 
@@ -244,7 +254,7 @@ def _iterate_neighbours(graph: Graph) -> Iterator[tuple[Indices, Indices]]:
 def _repeat_in_turn(
     belief: Pair, channel: Channel, rounds: int, pair_rule: PairRule
 ) -> Pair:
-    """Exchange Gaussians some times, and fuse them two at a time."""
+    """Exchange Gaussians in so many rounds, and fuse them two at a time by `pair_rule`."""
 
     def fuse(received: _Received) -> Pair:
         return _fuse_in_turn(received, pair_rule)

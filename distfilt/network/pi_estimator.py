@@ -101,7 +101,10 @@ def stable_substeps(
 
 
 def _stable_step(largest: float, alpha: float, a: float, b: float) -> float:
-    """Return the step below which all modes up to the eigenvalue `largest` shrink."""
+    """Return the step h, in s, below which the modes of all eigenvalues up to `largest` shrink.
+
+    The modes are those of :func:`stable_substeps`, with the gains α, a and b in 1/s.
+    """
     # Without links and with alpha = 0 nothing moves, and any step will do.
     damping = max(alpha + a * largest, 1e-300)
     coupling = b * largest
@@ -123,12 +126,13 @@ def _warn_if_unstable_step(
     if h <= _stable_step(2 / graph.degree_bound_gain, alpha, a, b):
         return
     limit = _stable_step(2 / graph.max_stable_gain, alpha, a, b)
+    # A margin for rounding of the eigenvalues.
     if h > limit * (1 + 1e-9):
         warnings.warn(
             f"substeps must be more than {h / limit:.3g} times as many for the estimates to "
             f"stay bounded, got steps of {h:.6g} s for a limit of {limit:.6g} s",
             UnstableGain,
-            # Over `pi_step` and its validation to its caller.
+            # The warning points at the call of `pi_step`, above it and its validation.
             stacklevel=4,
         )
 
@@ -206,16 +210,14 @@ def pi_step(
         _warn_if_unstable_step(channel, dt / substeps, alpha, a, b)
     h = dt / n
     k = inputs.shape[-1]
-    # One exchange of (ν, η): mixing with I - h L, less the values themselves, gives -h
-    # L of both.
+    # One exchange of (ν, η) by I - h L, less the values themselves, gives -h L ν and -h L η.
     weights = _laplacian_weights(channel.graph, h)
     for j in range(n):
         pair = np.concatenate([nu, eta], axis=-1)
         change = channel.mix(pair, weights) - pair
         proportional = change[..., :k]
         integral = change[..., k:]
-        # ν += h (α (u - ν) + u') - a h L ν + b h L η;  η -= b h L ν, with the old ν in
-        # both.
+        # ν += h (α (u - ν) + u') - a h L ν + b h L η;  η -= b h L ν, with the old ν in both.
         u = inputs + j * h * slope
         drift = alpha * (u - nu) + slope
         nu = nu + h * drift + a * proportional - b * integral

@@ -83,8 +83,8 @@ def fuse_on_tree(
     # Both ends add the other one's information, or neither does.
     is_mutual = (arrived & arrived[:, graph.reverse])[..., None, None]
 
-    # Y_i + Σ (Y_j - Y_ij), and the mean about the own one:
-    # m_i + P Σ [Y_j (m_j - m_i) - Y_ij (m_ij - m_i)].
+    # Y_i⁺ = Y_i + Σ (Y_j - Y_ij), and the mean as a shift of the own one:
+    # m_i⁺ = m_i + P_i⁺ Σ [Y_j (m_j - m_i) - Y_ij (m_ij - m_i)].
     y_j = y[:, graph.senders]
     y_i = y[:, graph.receivers]
     own = m[:, graph.receivers]
@@ -97,7 +97,9 @@ def fuse_on_tree(
     fused_mean = (m + shift[..., 0]).reshape(means.shape)
     fused_cov = symmetrise(new_cov).reshape(covs.shape)
 
-    # Y_ij + (Y_i - Y_ij) + (Y_j - Y_ij), about the link's mean.
+    # Y_ij⁺ = Y_ij + (Y_i - Y_ij) + (Y_j - Y_ij), and the mean as a shift of the link's:
+    # m_ij⁺ = m_ij + P_ij⁺ [Y_j (m_j - m_ij) + Y_i (m_i - m_ij)]. The variables `other` and `shared`
+    # are m_j - m_i and m_ij - m_i.
     link_cov = _invert(np.where(is_mutual, y_i + y_j - link_y, link_y))
     pull = y_j @ (other - shared)[..., None] - y_i @ shared[..., None]
     shift = link_cov @ np.where(is_mutual, pull, 0.0)

@@ -25,11 +25,11 @@ __all__ = [
 ]
 
 
-_DENSE = 400
-"""Up to this many agents the eigenvalues of weights are computed to check them."""
+_MAX_DENSE_AGENTS = 400
+"""Up to this many agents, weights are checked by the eigenvalues of their dense matrix."""
 
 _POWER_ROUNDS = 100
-"""Rounds between two measurements of growth, for more agents."""
+"""For more agents: rounds of the power method before growth is measured, and while it is."""
 
 
 class UnstableGain(RuntimeWarning):
@@ -100,23 +100,28 @@ class ConsensusWeights(FrozenModel):
 def stack_weights(
     graph: Graph, self_weights: Array, link_weights: Array, *, received_offset: int = 0
 ) -> scipy.sparse.csr_array:
-    """Return the matrices of R runs as one block-diagonal matrix, diagonal entries first.
+    """Return the matrices of R runs as one block-diagonal matrix, in each row the diagonal first.
+
+    One sparse product then mixes the values of all runs.
 
     Parameters
     ----------
     graph : Graph
     self_weights, link_weights : ndarray, (R, A) and (R, E)
     received_offset : int
-        The matrix multiplies the runs' values, one below the other. With 0 the received
-        values are the same ones; delayed values stand so many rows below.
+        The matrix multiplies a column of all runs' values, one run below the other. With 0 an
+        agent receives its neighbours' values from there. Other values to receive, such as delayed
+        ones, are appended to the column; they begin this many rows further down.
     """
     data = interleave_weights(graph, self_weights, link_weights)
     n_runs, n_agents = self_weights.shape
     run = np.arange(n_runs)[:, None]
+    # The columns of the entries: agent i of run r has row and column i + A r.
     diagonal = np.arange(n_agents) + n_agents * run
     received = graph.senders + n_agents * run + received_offset
+    # The diagonal entry comes before the links of its row, which begin at indptr[i].
     columns = np.insert(received, graph.links.indptr[:-1], diagonal, axis=1)
-    # Each row is longer by the diagonal entry; a run follows the other.
+    # Each row has one entry more than links, the diagonal's; the runs' rows follow each other.
     row_ends = graph.links.indptr[1:] + np.arange(1, n_agents + 1)
     row_ends = row_ends + data.shape[1] * run
     pointers = np.concatenate([[0], row_ends.ravel()])
@@ -127,11 +132,12 @@ def stack_weights(
 def interleave_weights(graph: Graph, self_weights: Array, link_weights: Array) -> Array:
     """Return the entries of a matrix of weights in their order, (R, A + E).
 
-    Every row: the diagonal entry, then those of the links, ascending by sender. Sums are
-    added in this order, which makes them those of a loop over messages to the bit.
+    Every row has the diagonal entry first, then those of the links, ascending by sender. A
+    product adds in this order, so that it equals a loop over the messages to the last bit.
     """
     n_agents = graph.n_agents
-    # A diagonal entry stands before the links of its row, and after those of the rows above.
+    # Row i begins behind the indptr[i] links and the i diagonal entries of the rows above it, with
+    # its diagonal entry. Link e, of row i, comes behind e links and i + 1 diagonal entries.
     diagonal = graph.links.indptr[:-1] + np.arange(n_agents)
     entries = np.empty((len(self_weights), n_agents + graph.senders.size))
     entries[:, diagonal] = self_weights
@@ -152,8 +158,8 @@ def _check_same_links(weights: ConsensusWeights, graph: Graph) -> None:
     )
 
 
-def _with_unit_rows(graph: Graph, link_weights: Array) -> ConsensusWeights:
-    """Return link weights with self-weights that make each row sum to one."""
+def _add_self_weights(graph: Graph, link_weights: Array) -> ConsensusWeights:
+    """Return weights of link weights (E,) and of self-weights that make each row sum to one."""
     self_weights = 1 - np.asarray(graph.incidence @ link_weights)
     return ConsensusWeights.construct(graph, self_weights, link_weights)
 
@@ -179,7 +185,7 @@ def metropolis(graph: Graph) -> ConsensusWeights:
     graph._check_undirected()
     degree = graph.in_degree
     larger = np.maximum(degree[graph.receivers], degree[graph.senders])
-    return _with_unit_rows(graph, 1 / (1 + larger))
+    return _add_self_weights(graph, 1 / (1 + larger))
 
 
 def _laplacian_weights(graph: Graph, gain: float) -> ConsensusWeights:
@@ -199,13 +205,14 @@ def _warn_if_unstable(graph: Graph, gain: float) -> None:
     if gain <= graph.degree_bound_gain:
         return
     limit = graph.max_stable_gain
+    # An eigenvalue solver's error is far below 1e-9: a gain of exactly 2/λ_max gives no warning.
     if gain > limit * (1 + 1e-9):
         warnings.warn(
             f"gain must be at most 2/λ_max = {limit:.6g} of this graph for the agents to agree, "
             f"got {gain:.6g}",
             UnstableGain,
-            # From here over the consensus rule and its validation to the caller of the
-            # rule.
+            # The warning points at the call of the consensus rule: above this function are
+            # the rule, its validation, and then the caller.
             stacklevel=4,
         )
 
@@ -276,7 +283,8 @@ def fastest_mixing(graph: Graph) -> ConsensusWeights:
     if forward.size < 2:
         return start
     solutions = [start.link_weights[forward]]
-    # Each solution starts the next, less smooth problem.
+    # Each solution starts the next, less smooth problem. The smooth function exceeds the largest
+    # modulus by at most μ log 2A, which the last μ makes less than 1e-3.
     for mu in (1e-1, 1e-2, 1e-3, 1e-4):
         solution = minimize(
             _smooth_modulus,
@@ -303,7 +311,7 @@ def _symmetric_weights(
     link_weights = np.empty(graph.senders.size)
     link_weights[forward] = pair_weights
     link_weights[graph.reverse[forward]] = pair_weights
-    return _with_unit_rows(graph, link_weights)
+    return _add_self_weights(graph, link_weights)
 
 
 def _decompose(
@@ -347,11 +355,11 @@ def expected_gossip(graph: Graph) -> ConsensusWeights:
     array([0.5, 0.5])
     """
     graph._check_undirected()
-    # Agent i wakes and chooses j, or j wakes and chooses i; half of the difference
-    # moves.
+    # Agent i wakes and chooses j, or j wakes and chooses i. Both then take their mean: each moves
+    # by half of the difference.
     degree = np.maximum(graph.in_degree, 1)
     either = 1 / degree[graph.receivers] + 1 / degree[graph.senders]
-    return _with_unit_rows(graph, either / (2 * graph.n_agents))
+    return _add_self_weights(graph, either / (2 * graph.n_agents))
 
 
 @validated
@@ -391,17 +399,17 @@ def doubly_stochastic(graph: Graph) -> ConsensusWeights:
         p = _left_null_vector(graph.laplacian)
     else:
         p = np.ones(graph.n_agents)
-    # The largest scaled degree leaves half of its agent's own value.
+    # With this scale the smallest self-weight is 1/2, that of the largest scaled degree.
     link_weights = p[graph.receivers] / (2 * (p * graph.in_degree).max())
-    return _with_unit_rows(graph, link_weights)
+    return _add_self_weights(graph, link_weights)
 
 
 def _left_null_vector(laplacian: scipy.sparse.csr_array) -> Array:
     """Return the positive p with pᵀ L = 0 of a strongly connected graph, largest entry 1."""
     from scipy.sparse.linalg import splu
 
-    # With p_0 = 1 the other rows of Lᵀ p = 0 are an M-matrix's, which needs no
-    # pivoting.
+    # With p_0 = 1, the other rows of Lᵀ p = 0 are a system whose matrix is an M-matrix: its LU
+    # factorisation is stable without pivoting.
     transposed = laplacian.T.tocsc()
     matrix = transposed[1:, 1:]
     right = -transposed[1:, [0]].toarray().ravel()
@@ -414,6 +422,7 @@ def _left_null_vector(laplacian: scipy.sparse.csr_array) -> Array:
     others = factor.solve(right)
     # One step of iterative refinement, for long rings.
     others += factor.solve(right - matrix @ others)
+    # All entries are positive (Perron and Frobenius); rounding may leave a tiny negative one.
     p = np.abs(np.concatenate([[1.0], others]))
     return np.asarray(p / p.max())
 
@@ -421,8 +430,8 @@ def _left_null_vector(laplacian: scipy.sparse.csr_array) -> Array:
 def _check_keeps_average(weights: ConsensusWeights) -> None:
     """Refuse weights of which a column or a row does not sum to one."""
     graph = weights.graph
-    # Not by the matrix: scipy's sums sort its entries in place, which changes how sums
-    # round.
+    # Not by sums of the matrix: scipy sorts its entries in place for them, and later products
+    # would round in another order.
     _check_sums_to_one(weights, graph.senders, "columns", "keep the average")
     _check_sums_to_one(
         weights,
@@ -433,33 +442,39 @@ def _check_keeps_average(weights: ConsensusWeights) -> None:
 
 
 def _warn_if_not_converging(weights: ConsensusWeights, rounds: int) -> None:
-    """Warn the user of weights with which averaging diverges, or stays as it is."""
+    """Warn the user of weights with which the agents' differences grow, or do not shrink."""
     graph = weights.graph
-    if _converges_plainly(weights):
+    if _has_positive_weights(weights):
         return
-    is_small = graph.n_agents <= _DENSE
-    if is_small:
+    # The factor by which a round multiplies the slowest mode of differences.
+    if graph.n_agents <= _MAX_DENSE_AGENTS:
         factor = weights.convergence_factor
+    elif _is_periodic(weights):
+        factor = 1.0
     else:
-        factor = 1.0 if _is_periodic(weights) else _growth(weights)
-    # A single round may leave differences as they are, where weights change in time. Those of
-    # parts without a link remain, which a warning of its own says.
+        factor = _measure_growth(weights)
+    # Margins for rounding: a factor of 1 does not diverge, and one just below it does not stall.
     diverges = factor > 1 + 1e-9
+    # A factor of 1 is no mistake in a single round, since the weights of the next round may be
+    # others. Nor is it one on a graph of several components, which never agree: the warning for
+    # that is Disconnected.
     stalls = rounds > 1 and graph.is_connected and factor > 1 - 1e-12
     if diverges or stalls:
         warnings.warn(
             "weights must have eigenvalues below 1 in modulus, but for the average's, for the "
             f"agents to agree, got {factor:.6g}",
             UnstableGain,
-            # Over the consensus rule and its validation to the caller of the rule.
+            # The warning points at the call of the rule, as in _warn_if_unstable.
             stacklevel=4,
         )
 
 
 def _is_periodic(weights: ConsensusWeights) -> bool:
-    """Whether nonnegative weights leave agents apart in every second round.
+    """Whether nonnegative weights keep groups of agents apart, so that they never agree.
 
-    As where neighbours swap their values, or where links of a bridge have no weight.
+    Two rounds are one step with W². If its graph is not strongly connected, some differences
+    remain: where all agents swap their values with a neighbour, W has the eigenvalue -1; where a
+    bridge has a weight of zero, it has the eigenvalue 1 twice.
     """
     if (weights.self_weights < 0).any() or (weights.link_weights < 0).any():
         return False
@@ -469,29 +484,44 @@ def _is_periodic(weights: ConsensusWeights) -> bool:
     return int(count) > 1
 
 
-def _growth(weights: ConsensusWeights) -> float:
-    """Return the factor by which the differences of many agents grow in a round, in the end."""
+def _measure_growth(weights: ConsensusWeights) -> float:
+    """Return the factor by which differences grow in a round after many rounds: power method.
+
+    It tends to the largest modulus of the eigenvalues of W, that of the average left out.
+    """
     # A random start has a part of every mode; a fixed seed makes the result repeatable.
     x = np.random.default_rng(0).standard_normal(weights.graph.n_agents)
     sizes = []
     for _ in range(2):
         for _ in range(_POWER_ROUNDS):
             x = weights.matrix @ x
+            # Only the differences from the average.
             x = x - x.mean()
         sizes.append(float(np.linalg.norm(x)))
-        # Scaled, as it may have become very large or very small.
+        # Scaled to length one, as it may have become very large or very small; zero stays zero.
         x = x / max(sizes[-1], 1e-300)
+    # The second size is the growth over _POWER_ROUNDS rounds from a length of one.
     return float(sizes[-1] ** (1 / _POWER_ROUNDS))
 
 
 def _check_sums_to_one(
     weights: ConsensusWeights, agents: Indices, name: str, purpose: str
 ) -> None:
-    """Refuse weights of which a row (by receivers) or a column (by senders) misses one."""
+    """Refuse weights of which a row or a column does not sum to one.
+
+    Parameters
+    ----------
+    weights : ConsensusWeights
+    agents : ndarray of int, (E,)
+        The agent in whose sum each link's weight is: its receiver for rows, its sender for columns.
+    name, purpose : str
+        Rows or columns, and the purpose of sums of one, for the error.
+    """
     n_agents = weights.graph.n_agents
     link_weights = weights.link_weights
     sums = weights.self_weights + np.bincount(agents, link_weights, n_agents)
-    # Rounding grows with the weights that cancel in a sum.
+    # Rounding grows with the weights that cancel in a sum; 1e-9 of them is far more than it, and
+    # far less than a mistake.
     scale = np.abs(weights.self_weights)
     scale = scale + np.bincount(agents, np.abs(link_weights), n_agents)
     error = np.abs(sums - 1) / np.maximum(1.0, scale)
@@ -503,10 +533,11 @@ def _check_sums_to_one(
         )
 
 
-def _converges_plainly(weights: ConsensusWeights) -> bool:
-    """Whether signs alone show that averaging converges: no weight is negative or missing.
+def _has_positive_weights(weights: ConsensusWeights) -> bool:
+    """Whether all weights are positive, so that averaging converges on a connected graph.
 
-    A nonnegative matrix with a positive diagonal has no eigenvalue of modulus 1 but 1 itself,
-    which is simple if no link of a connected graph lacks its weight (Perron and Frobenius).
+    By the theorem of Perron and Frobenius: a nonnegative matrix whose rows sum to one and whose
+    diagonal is positive has no other eigenvalue of modulus 1 than 1 itself. That one is simple if
+    every link of the connected graph has a positive weight.
     """
     return bool((weights.self_weights > 0).all() and (weights.link_weights > 0).all())

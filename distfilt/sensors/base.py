@@ -74,8 +74,8 @@ def wrap(
     if inside.all():
         return np.array(angles)
     wrapped = (angles + half) % period - half
-    # Rounding can turn an angle just below -half into +half, which is the same
-    # direction.
+    # Rounding can turn an angle just below -half into +half: the same direction, but outside the
+    # half-open interval.
     wrapped = np.where(wrapped >= half, -half, wrapped)
     # The shift by half a period costs digits: angles inside keep all of theirs.
     return np.asarray(np.where(inside, angles, wrapped))
@@ -152,8 +152,8 @@ class Sensor(FrozenModel):
                 "residual_function must be None for a sensor with periods, which wrap its "
                 "differences"
             )
-        # The residual of 1 + 1e-6 and 1 is 1e-6, and -1e-6 if the arguments were
-        # exchanged.
+        # The residual of 1 + 1e-6 and 1 must be 1e-6; it is -1e-6 for predicted minus observed.
+        # Halfway to that, -5e-7, rounding cannot decide.
         one = np.ones(self.dim)
         residual = call_user(self.residual_function, one + 1e-6, one)
         if (np.asarray(residual) < -5e-7).any():
@@ -207,7 +207,8 @@ class Sensor(FrozenModel):
         """
         if self.residual_function is None:
             return align(values, reference, cast(Periods, self.periods))
-        # r - residual(r, v) is v on the branch of r, if the residual wraps.
+        # The residual r - v of a reference r and a value v wraps into half a period, so that
+        # r - residual(r, v) is v on the branch of r.
         reference = np.broadcast_to(reference, values.shape)
         aligned = reference - self.residual(reference, values)
         return np.where(np.isnan(aligned), values, aligned)
@@ -299,11 +300,11 @@ class Sensor(FrozenModel):
                 f"sensor must be linear to have a matrix H, got one of kind {self.kind!r}"
             )
         matrix = check_array(call_user(self.linear, dim), "linear", (self.dim, dim))
-        # A user's matrix is compared once with h, which maps the rows of I to those of
-        # Hᵀ.
+        # A user's matrix is compared once with h: for a linear h, h(e_i) is column i of H.
         if is_first_use(self, "linear"):
             predicted = self.predict(np.eye(dim))
-            # Predictions that wrap may be on another branch.
+            # Predictions that wrap may be on another branch. Five digits are enough to tell a wrong
+            # matrix from the rounding of h.
             difference = self.residual(predicted, matrix.T)
             if not np.allclose(
                 difference, 0.0, atol=1e-9 + 1e-5 * np.abs(matrix).max()
@@ -342,8 +343,7 @@ class Sensor(FrozenModel):
         if self.derivative is not None and not needs_differences(self):
             return call_derivative(self.derivative, states, shape)
 
-        # The previous states stay fixed while the present one is varied along a new
-        # axis.
+        # The previous states stay fixed while the present one is varied along a new axis.
         fixed = [state[..., None, :] for state in states[1:]]
         predict = self.predict
 

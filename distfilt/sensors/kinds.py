@@ -70,7 +70,7 @@ def component(
     """
     return Sensor.construct(
         len(indices),
-        partial(_pick, indices=indices),
+        partial(_select, indices=indices),
         _diagonal_cov([std] * len(indices)),
         kind="component",
         linear=partial(_selection_matrix, indices=indices),
@@ -135,24 +135,26 @@ def _diagonal_cov(stds: Sequence[float]) -> Array:
     return cov
 
 
-def _pick(x: Array, indices: Sequence[int]) -> Array:
+def _select(x: Array, indices: Sequence[int]) -> Array:
+    """Return components of states (..., d), as a copy (..., n)."""
     # A list of indices copies; a tuple would index one axis for each entry.
     return x[..., list(indices)]
 
 
 def _selection_matrix(dim: int, indices: Sequence[int]) -> Array:
-    """Return the rows of the identity that pick components."""
-    # The dimension of the state is known only now, and with it which indices are too
-    # large.
+    """Return the matrix (n, `dim`) that selects components of a state: rows of the identity."""
+    # Only here is the dimension of the state known, and so which indices are too large.
     Bounds(below=dim)(max(indices), "indices")
-    return _pick(np.eye(dim), indices).T
+    return _select(np.eye(dim), indices).T
 
 
 def _increment(x: Array, previous: Array, indices: Sequence[int]) -> Array:
-    return np.asarray(_pick(x, indices) - _pick(previous, indices))
+    """Return changes (..., n) of components from the previous states to the present ones."""
+    return np.asarray(_select(x, indices) - _select(previous, indices))
 
 
 def _increment_jacobian(x: Array, previous: Array, indices: Sequence[int]) -> Array:
+    """Return the derivative (n, d) of changes by the present states."""
     # The previous state does not depend on the present one.
     return _selection_matrix(x.shape[-1], indices)
 
@@ -418,16 +420,19 @@ def _own_heading(x: Array, indices: Sequence[int], observer: Sequence[int]) -> A
     return np.asarray(x[..., observer[len(indices)]])
 
 
-def _norm(vectors: Array) -> Array:
-    """Return lengths with a last axis of one."""
+def _lengths(vectors: Array) -> Array:
+    """Return the lengths of vectors (..., n), as (..., 1)."""
     return np.asarray(np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True)))
 
 
-def _scatter(
+def _insert_columns(
     slope: Array, indices: Sequence[int], observer: Sequence[int], dim: int
 ) -> Array:
-    """Return derivatives (..., m, n) by an offset as those by all `dim` components."""
-    # The other components do not enter.
+    """Return the Jacobian (..., m, `dim`) of a function of the offset from the sensor to a place.
+
+    `slope` (..., m, n) is its derivative by the offset, p - s: by the components of the place p it
+    is the same, by those of the sensor's own place s its negative, and by all others zero.
+    """
     jacobian = np.zeros((*slope.shape[:-1], dim))
     jacobian[..., list(indices)] = slope
     if observer:
@@ -439,7 +444,7 @@ def _distance(
     x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
 ) -> Array:
     """Return distances (..., 1) of states (..., d) from the sensor."""
-    return _norm(_offset(x, indices, origin, observer))
+    return _lengths(_offset(x, indices, origin, observer))
 
 
 def _distance_jacobian(
@@ -447,8 +452,8 @@ def _distance_jacobian(
 ) -> Array:
     """Return the derivatives (..., 1, d) of distances."""
     offset = _offset(x, indices, origin, observer)
-    slope = _distance_slope(offset, _norm(offset))
-    return _scatter(slope[..., None, :], indices, observer, x.shape[-1])
+    slope = _distance_slope(offset, _lengths(offset))
+    return _insert_columns(slope[..., None, :], indices, observer, x.shape[-1])
 
 
 def _distance_slope(offset: Array, length: Array) -> Array:
@@ -482,18 +487,17 @@ def _angle_jacobian(
 ) -> Array:
     """Return the derivatives (..., 1, d) of directions, NaN at the sensor's own place."""
     offset = _offset(x, indices, origin, observer)
-    slope = _angle_slope(offset, _norm(offset))
-    jacobian = _scatter(slope[..., None, :], indices, observer, x.shape[-1])
+    slope = _angle_slope(offset, _lengths(offset))
+    jacobian = _insert_columns(slope[..., None, :], indices, observer, x.shape[-1])
     if len(observer) > len(indices):
-        # The bearing decreases as the sensor turns; NaN where there is none.
+        # The bearing decreases as the sensor turns. Adding 0 · NaN gives NaN where there is none.
         jacobian[..., 0, observer[len(indices)]] = -1.0 + 0.0 * slope[..., 0]
     return jacobian
 
 
 def _angle_slope(offset: Array, length: Array) -> Array:
     """Return the derivative of vectors' angles, and NaN at the vector zero."""
-    # ∂ arctan2(b, a) / ∂(a, b) = (-b, a) / (a² + b²); by unit vectors, so that no
-    # square overflows.
+    # ∂ arctan2(b, a) / ∂(a, b) = (-b, a) / (a² + b²), by unit vectors to avoid overflow.
     length = np.where(length > 0, length, np.nan)
     unit = offset / length
     slope = np.empty(unit.shape)
@@ -514,7 +518,7 @@ def _range_bearing(
     offset = _offset(x, indices, origin, observer)
     total_heading = heading + _own_heading(x, indices, observer)
     angle = _direction(offset, 2 * np.pi, total_heading)
-    return np.concatenate([_norm(offset), angle], axis=-1)
+    return np.concatenate([_lengths(offset), angle], axis=-1)
 
 
 def _range_bearing_jacobian(
@@ -523,13 +527,14 @@ def _range_bearing_jacobian(
     """Return the derivatives (..., 2, d) of distances and bearings."""
     # A constant heading only shifts the bearing, so that it does not enter.
     offset = _offset(x, indices, origin, observer)
-    length = _norm(offset)
+    length = _lengths(offset)
     slopes = np.empty((*offset.shape[:-1], 2, 2))
     slopes[..., 0, :] = _distance_slope(offset, length)
     slopes[..., 1, :] = _angle_slope(offset, length)
-    jacobian = _scatter(slopes, indices, observer, x.shape[-1])
+    jacobian = _insert_columns(slopes, indices, observer, x.shape[-1])
     if len(observer) > len(indices):
         turn = observer[len(indices)]
+        # As in `_angle_jacobian`
         jacobian[..., 1, turn] = -1.0 + 0.0 * slopes[..., 1, 0]
     return jacobian
 
@@ -573,7 +578,9 @@ def angles_only(
         2,
         partial(_angles_only, form=form, observer=observer, hidden=hidden),
         _diagonal_cov([std, std]),
-        # The first angle is a direction in the plane; a declination, or an arcsine, is none.
+        # The first angle is a direction in the plane and repeats after 2π. The second, a
+        # declination, lies between -π/2 and π/2. (So does the first in the printed
+        # form, an arcsine.)
         periods=(2 * np.pi, None),
         kind="angles_only",
     )
@@ -589,8 +596,7 @@ def _angles_only(
     sight = target - place
     # Rounding can bring a component of the unit vector above one, where arcsin is NaN.
     unit = np.clip(sight / np.linalg.norm(sight, axis=-1, keepdims=True), -1, 1)
-    # The declination is arcsin(z), the second angle of both forms; the printed first is
-    # arcsin(y).
+    # The declination is arcsin(z), the second angle of both forms; the printed first is arcsin(y).
     angles: Array = np.arcsin(unit[..., 1:])
     if form == "arctan2":
         angles[..., 0] = np.arctan2(unit[..., 1], unit[..., 0])
@@ -633,8 +639,7 @@ def from_name(
         "line_angle": line_angle,
         "bearing": bearing,
     }
-    # The conditions of angles, which the annotations cannot state beside those of the
-    # others.
+    # Limits that hold for angles only, which the shared annotations cannot state.
     if kind in ("line_angle", "bearing"):
         Bounds(at_most=np.pi)(std, "std")
         if len(indices) != 2:
@@ -672,8 +677,7 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
     # Independent noise: R is block diagonal.
     cov = block_diag(*[sensor.noise_cov for sensor in sensors])
     cov.setflags(write=False)
-    # Residuals are split only if some part wraps; plain subtraction does for the
-    # others.
+    # Only if a part wraps, residuals are taken part by part; otherwise they are differences.
     residual_function = None
     periods: Periods = ()
     if any(sensor.residual_function is not None for sensor in sensors):
@@ -700,14 +704,17 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
 
 
 def _stack_predictions(*states: Array, sensors: Sequence[Sensor]) -> Array:
+    """Return the observations (..., M) that stacked sensors predict, one after the other."""
     return np.concatenate([s.predict(*states) for s in sensors], axis=-1)
 
 
 def _stack_jacobians(*states: Array, sensors: Sequence[Sensor]) -> Array:
+    """Return the Jacobians of stacked sensors, one below the other, (..., M, d)."""
     return np.concatenate([s.jacobian(*states) for s in sensors], axis=-2)
 
 
 def _stack_matrices(dim: int, sensors: Sequence[Sensor]) -> Array:
+    """Return the matrices H of stacked linear sensors, one below the other, (M, `dim`)."""
     return np.concatenate([s.H(dim) for s in sensors], axis=0)
 
 

@@ -109,7 +109,7 @@ class LikelihoodSensor(Sensor):
         sample: Callable[..., Array] | None = None,
         kind: str = "likelihood",
     ) -> None:
-        # A size that is none is refused below, by name.
+        # The checks below refuse a wrong `dim`; until then `noise_cov` needs some size.
         is_integer = isinstance(dim, int | np.integer) and not isinstance(dim, bool)
         is_size = is_integer and dim > 0
         vars(self).update(
@@ -187,7 +187,8 @@ class LikelihoodSensor(Sensor):
         if is_missing.all():
             return np.zeros(lead)
         if is_missing.any():
-            # Some observation stands in where there is none; its value is not used.
+            # The user's function gets a valid observation in place of a missing one; what it
+            # returns there is replaced by zero.
             observed = np.where(
                 is_missing[..., None], observed[~is_missing][0], observed
             )
@@ -210,7 +211,8 @@ class LikelihoodSensor(Sensor):
                 "log_likelihood must return numbers or minus infinity (impossible), got NaN or "
                 "infinity"
             )
-        # A function for one state may return the right shape with wrong numbers.
+        # A function for one state may return the right shape with wrong numbers. For the last state
+        # alone it must give the same as among all, up to the rounding of another order of sums.
         if lead and logs.size and is_first_use(self, "log_likelihood"):
             last = call_user(
                 self.log_likelihood,

@@ -6,7 +6,8 @@ The x-block of the Knothe-Rosenblatt map of a Gaussian is affine,
     - \mathbf K(\mathbf y - \bar{\mathbf y})\bigr),
 
 with the regression matrix K of x on y and the Cholesky factor L of the residuals' covariance. The
-minimiser of (12) over affine maps has this form with sample moments, so no solver is needed.
+minimiser of (12) over affine maps has this form with sample moments, so that no solver is needed.
+Equation numbers in this module are those of that paper.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ MapStates = Annotated[ArrayInput, "... N self.dim"]
 """Samples of x, or of the reference, with a map's number of components."""
 
 _ROUNDING = 1e-13
-"""Fraction of a variable's variance, or of its mean, that counts as rounding."""
+"""Fraction of a variable's variance, or of its mean, that counts as rounding: some hundred ε."""
 
 
 @runtime_checkable
@@ -68,13 +69,13 @@ class ConditionalMap(Protocol):
     """
 
     def __call__(self, y: Array, x: Array) -> Array:
-        """Return the reference samples of members."""
+        """Return the reference samples z (..., N, d) of y (..., N, m) and members x (..., N, d)."""
 
     def inverse(self, y: Array, z: Array) -> Array:
-        """Return the members of reference samples."""
+        """Return the members x of reference samples z, both (..., N, d); y may be one for all."""
 
     def log_det(self, y: Array, x: Array) -> Array:
-        """Return the log-determinant at each member."""
+        """Return the log-determinant of ∂S/∂x at each member, (..., N)."""
 
 
 @validated
@@ -109,14 +110,15 @@ def compose(
     np.float64(1.0)
     """
     _check_sizes(map_, y, x)
-    # The map may be the user's: its methods' own calls into the library are checked.
+    # `compose` is validated, which switches checks off for the calls that it makes. The map may be
+    # the user's own, and `call_user` switches them on again inside it.
     reference = call_user(map_.__call__, y, x)
     members = call_user(map_.inverse, observed[..., None, :], reference)
     return np.asarray(members)
 
 
 def _check_sizes(map_: ConditionalMap, y: Array, x: Array) -> None:
-    """Raise an error if samples do not have the sizes of a map, where it has any."""
+    """Raise an error if samples do not have the sizes of a map; a user's own may not know any."""
     for name, samples, size_name in (("y", y, "n_observed"), ("x", x, "dim")):
         size = getattr(map_, size_name, None)
         n_columns = samples.shape[-1]
@@ -127,6 +129,7 @@ def _check_sizes(map_: ConditionalMap, y: Array, x: Array) -> None:
 
 
 def _check_lower_triangular(value: Array, name: str) -> None:
+    """Raise an error unless matrices (..., d, d) are lower triangular, their diagonal positive."""
     diagonal = np.diagonal(value, axis1=-2, axis2=-1)
     if np.triu(value, 1).any() or not (diagonal > 0).all():
         raise ValueError(f"{name} must be lower triangular with a positive diagonal")
@@ -180,6 +183,7 @@ class AffineMap(FrozenModel):
         predicted = self.mean[..., None, :] + centred @ np.ascontiguousarray(
             self.gain.mT
         )
+        # Raises an error that names y if its leading axes do not fit those of the members.
         broadcast_leading(members.shape[:-1], predicted.shape[:-1], "y")
         return np.asarray(predicted)
 
@@ -222,7 +226,11 @@ def join_samples(y: Array, x: Array) -> Array:
 
 
 def join_enough_samples(y: Array, x: Array, n_members: int) -> Array:
-    """Return the variables (y, x), of which there must be fewer than members."""
+    """Return the variables (y, x) of each member, (..., N, m + d), fewer than members.
+
+    `n_members` counts the samples of all agents together: a covariance of m + d variables is
+    singular unless there are more.
+    """
     joint = join_samples(y, x)
     n_variables = joint.shape[-1]
     if n_members <= n_variables:
@@ -234,8 +242,10 @@ def join_enough_samples(y: Array, x: Array, n_members: int) -> Array:
 
 
 def check_variables(wrong: Mask, m: int, needs: str) -> None:
-    """Raise an error that names the first wrong variable of (..., m + d), y before x."""
-    # Wrong in any ensemble of a batch.
+    """Raise an error that names the first wrong variable of (..., m + d), y before x.
+
+    `needs` says in the message how variables have to be. One wrong ensemble of a batch is enough.
+    """
     flat_wrong = wrong.reshape(-1, wrong.shape[-1])
     columns = np.flatnonzero(flat_wrong.any(axis=0))
     if not columns.size:
@@ -252,7 +262,7 @@ def check_variables(wrong: Mask, m: int, needs: str) -> None:
 
 @validated
 def fit(y: ObservationSamples, x: StateSamples) -> AffineMap:
-    """Fit the affine map to samples in closed form: the minimiser of (12).
+    """Fit the affine map to samples in closed form: the minimiser of (12) of Grange et al.
 
     Parameters
     ----------
@@ -299,7 +309,10 @@ def from_moments(mean: Array, covariance: Array, m: int) -> AffineMap:
 
 
 def _factor_joint(covariance: Array, m: int, needs: str) -> Array:
-    """Return the Cholesky factor of the covariance of (y, x), or raise an error for y or x."""
+    """Return the Cholesky factor of the covariance of (y, x), (..., m + d, m + d).
+
+    Where there is none, raise an error that names y or x. `needs` says how variables have to be.
+    """
     try:
         return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
     except np.linalg.LinAlgError:
@@ -313,11 +326,11 @@ def _factor_joint(covariance: Array, m: int, needs: str) -> Array:
 
 
 def from_rows(coefficients: Array, observed_mean: Array) -> AffineMap:
-    """Return the affine map of the coefficients of (13), component by component.
+    """Return the affine map of the coefficients of (13) of Grange et al., component by component.
 
-    Per component of the x-block, (..., d, 1 + m + d): the constant, the coefficients of y and those
-    of x, zero to the right of the diagonal and positive on it. The mean of x belongs to any
-    `observed_mean`.
+    Each component of the x-block has a row (..., d, 1 + m + d): the constant, the coefficients of
+    y, and those of x, which are zero to the right of the diagonal and positive on it. Coefficients
+    do not determine both means: that of y is given, and that of x follows from it.
     """
     split = 1 + observed_mean.shape[-1]
     # S(y, x) = c + B y + A x with A = L⁻¹, so K = -L B and x̄ = K ȳ - L c.
@@ -336,7 +349,10 @@ def objective(
     y: ObservationSamples,
     x: StateSamples,
 ) -> Array:
-    """Return the objective (12) of the x-block, summed over its components, (...).
+    r"""Return the objective (12) of Grange et al. of the x-block, (...).
+
+    .. math:: \frac1N\sum_i \tfrac12|\mathbf S(\mathbf y_i,\mathbf x_i)|^2
+        - \log\det\partial_{\mathbf x}\mathbf S(\mathbf y_i,\mathbf x_i)
 
     Up to a constant it is the negative mean log-likelihood of x given y under the map.
 
@@ -368,10 +384,10 @@ def fit_convex(
     *,
     solver: Literal["ECOS", "CLARABEL"] = "ECOS",
 ) -> AffineMap:
-    """Fit the affine map by the convex program (12), component by component, in cvxpy.
+    """Fit the affine map by the convex program (12) of Grange et al., with cvxpy.
 
-    The paper's way. :func:`fit` gives the same composed map in closed form, hundreds to thousands
-    of times faster.
+    The paper solves the program for one component after the other. :func:`fit` gives the same
+    composed map in closed form, hundreds to thousands of times faster.
 
     Parameters
     ----------
@@ -394,36 +410,38 @@ def fit_convex(
     """
     joint = join_enough_samples(y, x, len(x))
     m = y.shape[-1]
-    # Standardised variables, since a solver's tolerances are absolute.
+    # Standardised variables, since a solver's tolerances are absolute. A constant stays as it is.
     centre = joint.mean(axis=0)
     std = joint.std(axis=0)
-    std += std == 0
+    std[std == 0] = 1.0
     standard = (joint - centre) / std
+    # Rows (1, y, x) / √N, so that the mean square of a component S = Z u is |Z u|².
     design = np.column_stack([np.ones(len(joint)), standard])
     design = design / np.sqrt(len(joint))
     coefficients = np.zeros((x.shape[-1], design.shape[-1]))
     # The solver's warnings are silenced: the status is checked, and raises an error.
-    with _COMPILED, warnings.catch_warnings(), np.errstate(all="ignore"):
+    with _PROGRAM_LOCK, warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         for k in range(x.shape[-1]):
             # Component k uses the constant, y, and x up to its own.
             n = m + k + 2
             coefficients[k, :n] = _solve_component(design[:, :n], solver)
-    # Back from standardised variables.
+    # Back from standardised variables: u (z - c) / s is (u / s) z and the constant -(u / s) c.
     coefficients[:, 1:] /= std
     coefficients[:, 0] -= coefficients[:, 1:] @ centre
     return from_rows(coefficients, ensembles.mean(y))
 
 
-_COMPILED = Lock()
-"""A compiled program has the parameters of its last solution: one thread at a time."""
+_PROGRAM_LOCK = Lock()
+"""A compiled program is shared, and holds the parameters of one solution: one thread at a time."""
 
 
 def _solve_component(design: Array, solver: str) -> Array:
-    """Return the coefficients of one component for features (N, n), by a conic solver."""
+    """Return the coefficients (n,) of one component for features (N, n), by a conic solver."""
     cp = import_optional("cvxpy", "maps")
     n = design.shape[-1]
     problem, root, coefficients = _compile_program(n)
+    # R of the features Z = Q R, by which the program depends on them.
     root.value = np.asarray(np.linalg.qr(design, mode="r"))
     try:
         problem.solve(solver=solver, warm_start=False)
@@ -438,13 +456,13 @@ def _solve_component(design: Array, solver: str) -> Array:
 
 
 class _Symbol(Protocol):
-    """What is used of a parameter or a variable of cvxpy."""
+    """A parameter or a variable of cvxpy, as far as it is used here."""
 
     value: Array | None
 
 
 class _Program(Protocol):
-    """What is used of a problem of cvxpy."""
+    """A problem of cvxpy, as far as it is used here."""
 
     @property
     def status(self) -> str: ...
@@ -454,10 +472,11 @@ class _Program(Protocol):
 
 @lru_cache(maxsize=32)
 def _compile_program(n: int) -> tuple[_Program, _Symbol, _Symbol]:
-    """Return the program (12) of n coefficients, its parameter and its variable.
+    """Return the program (12) of Grange et al. for n coefficients, its parameter and its variable.
 
-    The samples enter by |u_0 + Z u|² only, which their QR factor keeps: the factor is the
-    parameter, and a program is compiled once for each size.
+    It minimises |Z u|² / 2 - log u_n, where a row of Z has the features of a sample over √N. With
+    Z = Q R the first term is |R u|² / 2, so that R (n, n) is the parameter, and one program serves
+    for any number of samples.
     """
     cp = import_optional("cvxpy", "maps")
     root = cp.Parameter((n, n))

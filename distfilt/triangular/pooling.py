@@ -155,9 +155,10 @@ def pool_by_admm(
     constant = np.ones((*standard.shape[:-1], 1))
     design = np.concatenate([constant, standard], axis=-1)
     moments = design.mT @ design / design.shape[-2]
-    # Component k of the state uses the constant, y, and x up to its own.
+    # Component k of the state uses the constant, y, and x up to its own: (d, 1 + m + d), of which
+    # the entries that are true are one vector of unknowns for ADMM.
     used = np.tri(d, 1 + m + d, m + 1, dtype=bool)
-    # The standard normal's map z_k = x_k is the start.
+    # The standard normal's map z_k = x_k is the start, for each of the A agents.
     identity = np.eye(d, 1 + m + d, m + 1)
     start = np.tile(identity[used], (len(joint), 1))
     run = admm(
@@ -179,7 +180,10 @@ def pool_by_admm(
 def _average_scales(
     joint: Array, m: int, channel: Channel, average: AverageRule
 ) -> tuple[Array, Array]:
-    """Return the agents' averages of each variable's mean and standard deviation, (A, m + d)."""
+    """Return the mean and standard deviation of each variable over all agents, (A, m + d) each.
+
+    They are found by consensus from the agents' own samples (A, N, m + d): each has a copy.
+    """
     centre = _average_values(mean(joint), channel, average)
     anomalies = joint - centre[:, None, :]
     squares = (anomalies**2).mean(axis=-2)
@@ -191,11 +195,15 @@ def _average_scales(
 
 
 def _average_values(values: Array, channel: Channel, average: AverageRule) -> Array:
-    """Return the agents' averages, or raise an error if they cannot be averages of the values."""
+    """Return the averages of values (..., A, n) over the agents, by a rule of consensus.
+
+    Raises an error if they cannot be averages of the values.
+    """
     averages = call_user(average, values, channel)
     averages = check_array(averages, "average", values.shape)
     exact = values.mean(axis=-2, keepdims=True)
-    # A rule that is only approximate may be off by as much as the values differ.
+    # A rule that is only approximate may be off by as much as the values differ, twice that for
+    # one that overshoots, and by rounding where all are equal.
     spread = np.ptp(values, axis=-2, keepdims=True)
     tolerance = 2 * (spread + 1e-9 * np.abs(exact))
     if (np.abs(averages - exact) > tolerance).any():
@@ -207,12 +215,15 @@ def _average_values(values: Array, channel: Channel, average: AverageRule) -> Ar
 
 
 def _proximal_step(moments: Array, used: Mask) -> Callable[[Array, float], Array]:
-    """Return the proximal step of all agents, on their used coefficients (A, n).
+    """Return the proximal step of all agents, the formula of :func:`pool_by_admm`.
 
-    The `moments` are those of (1, y, x), (A, 1 + m + d, 1 + m + d).
+    The `moments` are the second moments C of (1, y, x), (A, 1 + m + d, 1 + m + d). The step is a
+    function of the targets Z - W and of rho. It works on the used coefficients, one row an agent.
     """
 
     def solve(target: Array, rho: float) -> Array:
+        """Return the coefficients u (A, n) of the agents for their targets Z - W (A, n)."""
+        # Unpacked to (A, d, 1 + m + d): b, which each component's solution replaces.
         coefficients = np.zeros((len(target), *used.shape))
         coefficients[:, used] = rho * target
         for k in range(len(used)):

@@ -42,7 +42,7 @@ _SINGULAR = 1e-12
 _LEAST_SLOPE = 0.1
 """Least linear coefficient, per standard deviation; the best affine map has at least 1."""
 _ITERATIONS = 100
-"""Largest number of Newton steps."""
+"""Largest number of Newton steps; ten are enough as a rule."""
 _HALVINGS = 40
 """Largest number of times that a Newton step is tried, halved each time."""
 
@@ -112,13 +112,16 @@ class SeparableMap:
         return np.asarray(centred / self.std[..., None, :])
 
     def _earlier_part(self, joint: Array, k: int) -> Array:
-        """Return component k's part of the variables before its own, (..., N)."""
+        """Return the terms of component k in the variables before its own, (..., N).
+
+        `joint` has the standardised (y, x), (..., N, m + d).
+        """
         used = self.uses[k]
         features = _earlier_features(joint[..., used], self.bumps[..., used, :])
         return multiply_vector(features, self.weights[k])
 
     def _increasing_part(self, v: Array, k: int) -> tuple[Array, Array]:
-        """Return component k's part of its own variable and its derivative, (..., N)."""
+        """Return the terms of component k in its own variable v (..., N), and their derivative."""
         values, rates = _increasing_features(v, self.steps[..., k, :])
         slopes = self.slopes[k]
         return multiply_vector(values, slopes), multiply_vector(rates, slopes)
@@ -129,6 +132,7 @@ class SeparableMap:
         joint = self._standardise(y, x)
         components = []
         for k in range(self.dim):
+            # A function of the earlier variables, and an increasing one of the own variable.
             v = joint[..., self.n_observed + k]
             increasing, _ = self._increasing_part(v, k)
             components.append(self._earlier_part(joint, k) + increasing)
@@ -140,18 +144,21 @@ class SeparableMap:
         if y.ndim == self.centre.ndim:
             y = y[..., None, :]
         m = self.n_observed
-        # The place of x is filled component by component; z only gives it its shape.
+        # Columns m and on are x, filled component by component; until then z is in their place,
+        # which gives the array its shape.
         joint = self._standardise(y, z)
         for k in range(self.dim):
+            # Component k in its own variable alone, as far as the earlier ones leave it open.
             target = z[..., k] - self._earlier_part(joint, k)
             # The increasing part lies between a_0 v and a_0 v + H, with H the sum of the steps'
-            # heights, so its root lies between (target - H) / a_0 and target / a_0.
-            line = self.slopes[k][..., :1]
+            # heights, so its root lies between (target - H) / a_0 and target / a_0. A step is as
+            # high as a_j times the area of its bump, of width sigma_j.
+            linear = self.slopes[k][..., :1]
             areas = _BUMP_AREA * self.steps[1][..., k, :]
             heights = areas * self.slopes[k][..., 1:]
             total_height = heights.sum(axis=-1, keepdims=True)
-            low = (target - total_height) / line
-            high = target / line
+            low = (target - total_height) / linear
+            high = target / linear
             part = partial(self._increasing_part, k=k)
             joint[..., m + k] = invert(part, target, low, high)
         std = self.std[..., None, m:]
@@ -173,7 +180,10 @@ class SeparableMap:
 
 
 def _earlier_features(v: Array, bumps: Array) -> Array:
-    """Return 1, the variables (..., N, L) and their bumps, (..., N, 1 + L + L p)."""
+    """Return 1, the L variables v (..., N, L) and their bumps, (..., N, 1 + L + L p).
+
+    `bumps` has the centres and widths of p bumps for each variable, (2, ..., L, p).
+    """
     centres, widths = bumps[..., None, :, :]
     u = (v[..., None] - centres) / widths
     heights = np.exp(-0.5 * u**2)
@@ -186,7 +196,10 @@ def _earlier_features(v: Array, bumps: Array) -> Array:
 
 
 def _increasing_features(v: Array, steps: Array) -> tuple[Array, Array]:
-    """Return the variable (..., N) and its integrated bumps, (..., N, 1 + q), and derivatives."""
+    """Return a variable v (..., N) with its integrated bumps, and their derivatives in v.
+
+    Both are (..., N, 1 + q). `steps` has the centres and widths of the q bumps, (2, ..., q).
+    """
     from scipy.special import ndtr
 
     centres, widths = steps[..., None, :]
@@ -210,27 +223,36 @@ def fit(
     regularisation: NonNegativeFloat = 0.0,
     uses: Sequence[Collection[NonNegativeInt]] | None = None,
 ) -> SeparableMap:
-    r"""Fit the separable map to samples: the minimiser of (12), regularised.
+    r"""Fit the separable map to samples: the minimiser of (12) of Grange et al., regularised.
 
-    .. math:: \mathcal L^k + \tfrac\lambda2\Bigl(\sum_{l,j} c_{lj}^2 + \sum_j a_j^2\Bigr)
+    Component k minimises the mean negative log-likelihood of its variable, given the earlier ones,
+    and a penalty:
 
-    The penalty is on the bumps only, so a large one gives the affine map. The linear coefficient
-    :math:`a_0` is at least 0.1 per standard deviation; the best affine map has at least 1.
+    .. math:: \frac1N\sum_i\Bigl(\tfrac12 S^k(\mathbf z_i)^2
+        - \log\partial_k S^k(\mathbf z_i)\Bigr)
+        + \tfrac\lambda2\Bigl(\sum_{l,j} c_{lj}^2 + \sum_{j\ge1} a_j^2\Bigr)
+
+    with the coefficients of the module's docstring: :math:`c_{lj}` of bump j of the earlier
+    variable l, :math:`a_j` of integrated bump j of the component's own variable. Linear
+    coefficients are not penalised, so a large penalty gives the affine map. The linear coefficient
+    :math:`a_0` of the own, standardised variable is at least 0.1, which keeps the map invertible;
+    that of the best affine map is at least 1, so that the bound excludes none of these.
 
     Parameters
     ----------
     y : array_like, (..., N, m)
         Predicted observations, with noise; m may be 0.
     x : array_like, (..., N, d)
-        StateSamples.
+        Members.
     order : int or (int, int)
-        Bumps per earlier variable, and integrated bumps of the own variable; one number is for
-        both. 0 gives the affine map.
+        Number of bumps per earlier variable, and of integrated bumps of the component's own
+        variable; one number is for both. 0 gives the affine map.
     regularisation : float
         The penalty λ, at least 0.
     uses : sequence of collections of int, optional
-        For each of the d components, which earlier variables it may use: observations are 0 to
-        m - 1, state components follow. All by default. A component that leaves some out is sparse.
+        For each of the d components, the earlier variables that it may use, all by default:
+        observations are numbered 0 to m - 1, state components follow. Leaving variables out makes
+        the map sparse.
 
     Raises
     ------
@@ -257,30 +279,34 @@ def fit(
     True
     """
     m = y.shape[-1]
-    p, q = (order, order) if isinstance(order, int) else order
+    n_bumps, n_steps = (order, order) if isinstance(order, int) else order
     allowed = _check_uses(uses, m, x.shape[-1])
-    # A penalty determines the bumps' coefficients; without one the samples have to.
+    # The largest component has a constant and a linear coefficient for its own and for each
+    # earlier variable. The samples must determine them, and, unless a penalty does, its bumps'.
     most_used = max(len(used) for used in allowed)
-    needed = 2 + most_used
+    n_coefficients = 2 + most_used
     if not regularisation:
-        needed += q + most_used * p
-    if x.shape[-2] <= needed:
+        n_coefficients += n_steps + most_used * n_bumps
+    if x.shape[-2] <= n_coefficients:
         raise ValueError(
-            f"x must have more than {needed} members for as many coefficients, "
+            f"x must have more than {n_coefficients} members for as many coefficients, "
             f"got {x.shape[-2]}"
         )
     joint, centre, std = _standardise_samples(y, x)
     _check_combinations(joint, allowed, m)
-    bumps = _place_bumps(joint, p, m)
-    steps = _place_bumps(joint[..., m:], q, 0)
+    bumps = _place_bumps(joint, n_bumps, m)
+    # Integrated bumps are smooth steps; only the state's variables have them.
+    steps = _place_bumps(joint[..., m:], n_steps, 0)
     weights = []
     slopes = []
     for k, used in enumerate(allowed):
+        # Basis functions of the earlier variables, and of the own one with their derivatives.
         features = _earlier_features(joint[..., used], bumps[..., used, :])
-        v = joint[..., m + k]
-        values, rates = _increasing_features(v, steps[..., k, :])
+        own_variable = joint[..., m + k]
+        values, rates = _increasing_features(own_variable, steps[..., k, :])
+        n_linear = 1 + len(used)
         weight, slope = _fit_component(
-            features, values, rates, 1 + len(used), regularisation
+            features, values, rates, n_linear, regularisation
         )
         weights.append(weight)
         slopes.append(slope)
@@ -323,11 +349,15 @@ def _standardise_samples(y: Array, x: Array) -> tuple[Array, Array, Array]:
 
 
 def _check_combinations(joint: Array, uses: list[list[int]], m: int) -> None:
-    """Raise an error if a component's variables are combinations of each other, y before x."""
+    """Raise an error if a component's variables are linear combinations of each other.
+
+    `joint` has the standardised samples (y, x), (..., N, m + d); `uses` lists the earlier variables
+    of each component.
+    """
     correlation = joint.mT @ joint / joint.shape[-2]
     for k, used in enumerate(uses):
         observations = [v for v in used if v < m]
-        # A combination of the observations alone is y's fault.
+        # If the observations alone are combinations of each other, the error names y.
         for name, variables in (("y", observations), ("x", [*used, m + k])):
             block = correlation[..., variables, :][..., variables]
             if np.linalg.eigvalsh(block).min(initial=1.0) < _SINGULAR:
@@ -338,9 +368,12 @@ def _check_combinations(joint: Array, uses: list[list[int]], m: int) -> None:
 
 
 def _place_bumps(joint: Array, n: int, m: int) -> Array:
-    """Return centres at `n` quantiles of each variable, and widths from the quantiles between."""
-    # With n + 1 equal parts, the odd levels are the centres; a width is the distance of the two
-    # even levels around its centre.
+    """Return `n` centres for each variable, at sample quantiles, and widths, (2, ..., D, n).
+
+    The samples `joint` are (..., N, D). An error names a variable: the first m are y, others x.
+    """
+    # 2 n + 1 equally spaced levels: every second one is a centre, and its width is the distance
+    # of the two levels next to it.
     n_levels = 2 * n + 1
     levels = np.arange(1, n_levels + 1) / (n_levels + 1)
     quantiles = np.quantile(joint, levels, axis=-2)
@@ -359,7 +392,11 @@ def _fit_component(
 ) -> tuple[Array, Array]:
     r"""Return a component's coefficients: of the earlier variables, then the nonnegative ones.
 
-    For the component :math:`\Psi\mathbf c + \Phi\mathbf a` the objective (12) is
+    `features` is :math:`\Psi`, the functions of the earlier variables, `values` is :math:`\Phi`,
+    those of the own variable, and `rates` their derivatives :math:`\Phi'`. The first `n_linear`
+    features have no penalty. Shapes are (..., N, p), (..., N, q) and (..., N, q).
+
+    For the component :math:`\Psi\mathbf c + \Phi\mathbf a` the objective (12) of Grange et al. is
     :math:`\tfrac1{2N}|\Psi\mathbf c+\Phi\mathbf a|^2 - \tfrac1N\sum_i\log(\Phi'\mathbf a)_i`, to
     be minimised over free c and nonnegative a. For given a, the best c solves a regression,
     c = -W a, which leaves a quadratic form in a.
@@ -370,7 +407,7 @@ def _fit_component(
     is_step = np.arange(values.shape[-1]) >= 1
     feature_penalty = penalty * is_bump
     value_penalty = penalty * is_step
-    # W = (Psi' Psi / N + D)⁻¹ Psi' Phi / N.
+    # W = (Psi' Psi / N + D)⁻¹ Psi' Phi / N, with the penalty on the diagonal of D.
     normal_matrix = features.mT @ features / n + np.diag(feature_penalty)
     eigenvalues = np.linalg.eigvalsh(normal_matrix)
     smallest = eigenvalues[..., 0]
@@ -382,7 +419,7 @@ def _fit_component(
         )
     regression = np.linalg.solve(normal_matrix, features.mT @ values / n)
     residual = values - features @ regression
-    # Q = R' R / N + W' D W + E for the residuals R = Phi - Psi W.
+    # Q = R' R / N + W' D W + E for the residuals R = Phi - Psi W, E the penalty of a.
     quadratic = residual.mT @ residual / n
     weighted = feature_penalty[:, None] * regression
     quadratic = quadratic + regression.mT @ weighted
@@ -395,7 +432,7 @@ def _fit_component(
 
 
 def _loss(a: Array, quadratic: Array, rates: Array) -> Array:
-    """Return a'Qa / 2 - mean(log(rates a)), (...)."""
+    """Return the loss a'Qa / 2 - mean(log(rates a)), (...), of coefficients a (..., q)."""
     column = a[..., None]
     row = a[..., None, :]
     form = 0.5 * (row @ quadratic @ column)[..., 0, 0]
@@ -404,7 +441,11 @@ def _loss(a: Array, quadratic: Array, rates: Array) -> Array:
 
 
 def _minimise_nonnegative(quadratic: Array, rates: Array, lower: Array) -> Array:
-    """Minimise a'Qa / 2 - mean(log(rates a)) over a >= lower by projected Newton steps."""
+    """Minimise a'Qa / 2 - mean(log(rates a)) over a >= lower by projected Newton steps.
+
+    `quadratic` is Q (..., q, q), `rates` (..., N, q) are derivatives of the own variable's
+    functions, and `lower` (q,) the lower bounds. Returns a, (..., q).
+    """
     n = rates.shape[-2]
     identity = np.eye(quadratic.shape[-1])
     # The best affine map without steps, a_0 = Q_00^(-1/2), is the start.
@@ -412,7 +453,8 @@ def _minimise_nonnegative(quadratic: Array, rates: Array, lower: Array) -> Array
     affine_slope = 1 / np.sqrt(quadratic[..., 0, 0])
     a[..., 0] = np.maximum(lower[0], affine_slope)
     for _ in range(_ITERATIONS):
-        # Gradient Q a - mean(r_i / r_i'a) and Hessian Q + mean(r_i r_i' / (r_i'a)²).
+        # Gradient Q a - mean(r_i / r_i'a) and Hessian Q + mean(r_i r_i' / (r_i'a)²), where r_i
+        # is the row of rates of sample i.
         ratio = rates / (rates @ a[..., None])
         gradient = multiply_vector(quadratic, a) - ratio.mean(axis=-2)
         hessian = quadratic + ratio.mT @ ratio / n
@@ -425,7 +467,8 @@ def _minimise_nonnegative(quadratic: Array, rates: Array, lower: Array) -> Array
         solution = np.linalg.solve(system, free_gradient[..., None])
         step = -solution[..., 0]
         a = _search_projected(a, step, gradient, quadratic, rates, lower)
-        # The Newton decrement bounds the distance from the minimum.
+        # The Newton decrement g' H⁻¹ g is about twice the distance of the loss from its minimum,
+        # before the step. The loss is of the order of one, with a rounding of some 1e-15.
         decrement = -(free_gradient * step).sum(axis=-1)
         if (decrement < 1e-13).all():
             return a
@@ -440,15 +483,20 @@ def _search_projected(
     rates: Array,
     lower: Array,
 ) -> Array:
-    """Halve the projected step, in each run, until the loss decreases enough."""
+    """Halve the step from `start` (..., q), in each run, until the loss decreases enough.
+
+    A point below a bound is projected: moved to the bound. The other arguments are those of
+    :func:`_minimise_nonnegative` and its gradient.
+    """
     before = _loss(start, quadratic, rates)
     rounding = 1e-14 * (1 + np.abs(before))
     length = np.ones(start.shape[:-1])
     for _ in range(_HALVINGS):
         a = np.maximum(lower, start + length[..., None] * step)
-        # Armijo's condition; near the minimum the decrease is lost in rounding.
-        expected = 1e-4 * (gradient * (a - start)).sum(axis=-1)
-        accepted = _loss(a, quadratic, rates) <= before + expected + rounding
+        # Armijo's condition, with the customary 1e-4: the loss falls by some part of the decrease
+        # that the gradient predicts. Near the minimum the decrease is lost in rounding.
+        required = 1e-4 * (gradient * (a - start)).sum(axis=-1)
+        accepted = _loss(a, quadratic, rates) <= before + required + rounding
         if accepted.all():
             break
         length = np.where(accepted, length, 0.5 * length)
@@ -463,8 +511,10 @@ def invert(
 ) -> Array:
     """Solve ``function(v) = target`` by Newton's method inside a shrinking bracket.
 
-    The function returns values and positive derivatives, element by element. A Newton step that
-    would leave the bracket is replaced by a bisection, so the iteration converges.
+    The function returns values and positive derivatives, element by element. Target and bracket
+    are arrays of one shape, or broadcast to it, with a root between `low` and `high` in each
+    element. A Newton step that would leave the bracket is replaced by a bisection, so the
+    iteration converges.
 
     Raises
     ------
@@ -488,11 +538,13 @@ def invert(
         newton = v - error / derivative
         change = np.abs(newton - v)
         tolerance = 1e-13 * (1 + np.abs(v))
-        # A converged step may end on the bracket; any other has to be inside it and half as long
-        # as the last, or Newton's method could alternate for ever.
+        # Newton's step is taken where it is inside the bracket and at most half as long as the
+        # last, or the method could alternate for ever; and where it is within the tolerance, when
+        # rounding may put it on the end of the bracket.
         inside = (newton > low) & (newton < high)
-        trusted = inside & (change <= 0.5 * last_change)
-        new = np.where(trusted | (change <= tolerance), newton, 0.5 * (low + high))
+        shrinks = change <= 0.5 * last_change
+        takes_newton = (inside & shrinks) | (change <= tolerance)
+        new = np.where(takes_newton, newton, 0.5 * (low + high))
         last_change = np.abs(new - v)
         v = new
         if (last_change <= tolerance).all():

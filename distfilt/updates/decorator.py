@@ -101,6 +101,7 @@ def update(function: F) -> F:
     annotations["rng"] = Rng
 
     def call_checked(**arguments: object) -> Array:
+        """Call the function with checked arguments, after broadcasting their leading axes."""
         arrays = {}
         for name in data:
             value = arguments.get(name)
@@ -118,12 +119,17 @@ def update(function: F) -> F:
 
 
 def _share_leading_axes(arrays: dict[str, Array]) -> dict[str, Array]:
-    """Return predictions and observation with the ensemble's leading axes, where they differ."""
+    """Return predictions and observation with the ensemble's leading axes, where they differ.
+
+    Given are an update's first four arguments by their names; returned are those that change.
+    """
     ensemble, predicted, observed, noise = arrays.values()
     lead = ensemble.shape[:-2]
     leads = (predicted.shape[:-2], observed.shape[:-1], noise.shape[:-2])
+    # The usual case: all agree, and the noise has one covariance for each ensemble or one for all.
     if leads[0] == leads[1] == lead and leads[2] in ((), lead):
         return {}
+    # The function may call its arguments as it likes.
     _, name_predicted, name_observed, name_noise = arrays
     names = (name_predicted, name_observed, name_noise)
     for name, axes in zip(names, leads, strict=True):
@@ -137,13 +143,14 @@ def _share_leading_axes(arrays: dict[str, Array]) -> dict[str, Array]:
 
 
 def has_tag(update: Update, tag: str) -> bool:
-    """Return whether an update has a tag: ``stacks``, ``repredicts`` or ``accepts_missing``.
+    """Return whether an update has a tag, an attribute by which a filter knows how to call it.
 
-    One that stacks updates ensembles with a noise covariance each in one call, as every update of
-    this package does; a plain function gets one agent's ensemble at a time. One that repredicts
-    takes a function ``predict``. One that accepts missing components gets them as NaN. One that
-    weights members by their likelihoods (``weights_members``) compares each with the observation
-    by itself, so that predicted angles are brought near the observation one by one.
+    ``stacks``: it updates ensembles with a noise covariance each in one call, as every update of
+    this package does; a plain function gets one agent's ensemble at a time. ``repredicts``: it
+    takes a function ``predict``. ``locates``: it takes ``observation_places``.
+    ``accepts_missing``: it gets missing components as NaN. ``weights_members``: it compares each
+    member with the observation by itself, so that predicted angles are brought near the observation
+    one by one.
 
     >>> has_tag(print, "stacks")
     False
@@ -181,7 +188,7 @@ def perturb_observations(
     # The members' mean is then not changed by the draws.
     if centred:
         normal -= normal.mean(axis=-2, keepdims=True)
-    # zeta_i = L xi_i with R = L L'.
+    # h(x_i) + zeta_i with zeta_i = L xi_i and R = L L'. The sum overwrites the draws.
     perturbed = normal @ np.ascontiguousarray(cholesky(noise).mT)
     return np.asarray(np.add(perturbed, predicted, out=perturbed))
 
@@ -233,7 +240,7 @@ def with_missing(
     m = observed.shape[-1]
     # The caller's generator advances by the same amount for any pattern.
     seed = _draw_seed(rng)
-    # numpy's own functions: these arrays are small, and the step stays in one module.
+    # The usual case: nothing is missing.
     if np.isfinite(observed).all() and np.isfinite(predicted).all():
         stream = _stream(rng, seed, m, lead)
         result = call_user(update, ensemble, predicted, observed, noise, rng=stream)
@@ -257,11 +264,14 @@ def _update_by_pattern(
     rng: Rng,
     seed: list[int],
 ) -> Array:
-    """Update the ensembles of a batch, those with the same components `present` together."""
+    """Update the ensembles of a batch, those with the same components `present` together.
+
+    `data` are an update's first four arguments, `present` (..., m), and `seed` that of the draws.
+    """
     ensemble, predicted, observed, noise = data
     lead = observed.shape[:-1]
     m = observed.shape[-1]
-    # One leading axis from here on.
+    # All leading axes become one, the rows of the batch.
     flat_present = present.reshape(-1, m)
     flat_observed = observed.reshape(-1, m)
     flat_ensemble = ensemble.reshape(-1, *ensemble.shape[-2:])
@@ -294,10 +304,14 @@ def _update_by_pattern(
 
 
 def _draw_seed(rng: Rng) -> list[int]:
-    """Draw four words of 32 bits, of which seeds are made, in two raw draws of 64."""
-    a, b = rng.bit_generator.random_raw(2).tolist()
-    # The lowest bit is dropped: `integers` would use 63 bits of each draw.
-    return [a // 2 % 2**32, a >> 33, b // 2 % 2**32, b >> 33]
+    """Draw four words of 32 bits, of which seeds are made.
+
+    They are those of two integers below 2^63, ``rng.integers(2**63, size=2)``, which numpy makes of
+    raw draws of 64 bits without the lowest. Raw draws take a fraction of the time.
+    """
+    first, second = rng.bit_generator.random_raw(2).tolist()
+    # Bits 1 to 32 and bits 33 to 63 of each.
+    return [first // 2 % 2**32, first >> 33, second // 2 % 2**32, second >> 33]
 
 
 def _stream(
@@ -309,14 +323,15 @@ def _stream(
 ) -> Rng:
     """Return the random stream of updates with m components, for a batch or some of its rows.
 
-    An ensemble's draws depend on its row and on its number of components, not on the components
-    that others miss: each number has a stream of its own, drawn for all rows.
+    An ensemble's draws must not depend on which components other ensembles miss. So there is one
+    stream for each number m of components, and each stream is drawn for all rows of the batch
+    (*lead), of which a :class:`RowGenerator` returns those that are asked for.
     """
     # The number of components is part of the seed.
     words = np.array([*seed, m], dtype=np.uint32)
     bits = np.random.PCG64(np.random.SeedSequence(words))
     if isinstance(rng, RowGenerator):
-        # Rows of rows keep their places in the whole batch.
+        # The generator is already for some rows of a batch: pick from those.
         return RowGenerator(bits, rng.lead, rng.rows[rows])
     if isinstance(rows, EllipsisType):
         return Rng(bits)
@@ -364,7 +379,7 @@ class RowGenerator(Rng):
         values = np.asarray(x)
         if not self._has_rows(values.shape) or axis is None:
             return super().permuted(x, axis=axis, out=out)
-        # The other rows' slices only take their draws.
+        # The whole batch is permuted, so that every row uses up its own draws.
         whole = self._fill_batch(values).reshape(-1, *values.shape[1:])
         mixed = super().permuted(whole, axis=axis)[self.rows]
         if out is None:
@@ -373,7 +388,7 @@ class RowGenerator(Rng):
         return out
 
     def _has_rows(self, shape: tuple[int, ...]) -> bool:
-        """Whether rows have to be selected from draws of a shape with an entry for each."""
+        """Whether draws of a shape have an entry for each row, so that rows have to be selected."""
         return self.is_partial and shape[:1] == self.rows.shape
 
     def _fill_batch(self, values: Array) -> Array:
@@ -383,10 +398,13 @@ class RowGenerator(Rng):
         whole[self.rows] = values
         return whole.reshape(*self.lead, *values.shape[1:])
 
-    def _spread(self, parameter: ArrayLike, n_axes: int) -> ArrayLike:
-        """Return a parameter of draws with so many axes as one for the whole batch."""
+    def _extend_parameter(self, parameter: ArrayLike, n_axes: int) -> ArrayLike:
+        """Return a distribution's parameter for the rows as one for the whole batch.
+
+        The draws have `n_axes` axes, the first of which are the rows.
+        """
         values = np.asarray(parameter)
-        # A parameter without an axis of rows is that of all rows.
+        # A parameter without an axis of rows is the same for all rows.
         if values.ndim < n_axes:
             return parameter
         if len(values) == 1:
@@ -454,29 +472,38 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
 def _draw_rows(
     name: str, parameters: tuple[str, ...], by_row: bool
 ) -> Callable[..., Array]:
-    """Return the method of a distribution that draws for the batch and selects the rows."""
+    """Return the method of a distribution that draws for the batch and selects the rows.
+
+    `name` and `parameters` are numpy's; `by_row` says whether each row may have its own parameters.
+    """
+    # numpy's own method, which the new one calls.
     draw = getattr(np.random.Generator, name)
     names = (*parameters, "size", *_OPTIONS.get(name, ()))
 
     def method(self: RowGenerator, *args: Any, **options: Any) -> Any:
+        # All arguments by name, as numpy would bind them.
         bound = dict(zip(names, args, strict=False)) | options
         size = bound.get("size")
         if size is None and by_row and bound.get("out") is None:
             # Without a size it is that of the parameters.
-            given = [np.shape(bound[p]) for p in parameters if p in bound]
-            shape = np.broadcast_shapes(*given)
+            shapes = [np.shape(bound[p]) for p in parameters if p in bound]
+            shape = np.broadcast_shapes(*shapes)
         else:
             shape = tuple(size) if np.iterable(size) else ()
+        # Draws that do not belong to rows are numpy's.
         if not self._has_rows(shape):
             return draw(self, *args, **options)
+        # Draw for all rows of the batch, (*lead, ...), in place of this generator's, (n, ...).
         for p in parameters:
             if by_row and bound.get(p) is not None:
-                bound[p] = self._spread(bound[p], len(shape))
+                bound[p] = self._extend_parameter(bound[p], len(shape))
         bound["size"] = (*self.lead, *shape[1:])
         out = bound.pop("out", None)
         draws = draw(self, **bound)
-        n_rows = math.prod(self.lead)
-        selected = draws.reshape(n_rows, *draws.shape[len(self.lead) :])[self.rows]
+        # The batch's axes become one, of which `rows` are indices.
+        batch_size = math.prod(self.lead)
+        flat_draws = draws.reshape(batch_size, *draws.shape[len(self.lead) :])
+        selected = flat_draws[self.rows]
         if out is None:
             return selected
         out[...] = selected

@@ -39,7 +39,11 @@ ModelEnsemble = Annotated[Ensemble, "... n model.dim"]
 def _solve_gain(
     anomalies: Array, predicted_anomalies: Array, noise: Array | float = 0.0
 ) -> Array:
-    """Return the gain transposed, K' = (C_hh + R)⁻¹ C_hx, (..., m, d), by a solve."""
+    """Return the gain transposed, K' = (C_hh + R)⁻¹ C_hx, (..., m, d), by a solve.
+
+    The anomalies are those of the members, (..., N, d), and of their predictions, (..., N, m); the
+    noise covariance R is (..., m, m). Members are rows, so that they move by ``innovations @ K'``.
+    """
     # Both covariances times N - 1, which cancels.
     scaled_noise = (anomalies.shape[-2] - 1) * noise
     innovation_covariance = predicted_anomalies.mT @ predicted_anomalies + scaled_noise
@@ -136,7 +140,8 @@ def enkf(
     perturbed = perturb_observations(predicted, noise, rng, centred=centred)
     anomalies = center_ensemble(ensemble)[1]
     gain = _solve_gain(anomalies, center_ensemble(predicted)[1], noise)
-    # x_i + K (y* - y_i), in place.
+    # x_i + K (y* - y_i) with the perturbed predictions y_i; the results overwrite arrays that were
+    # made here, which saves time.
     innovations = np.subtract(observed[..., None, :], perturbed, out=perturbed)
     analysis = innovations @ gain
     return np.asarray(np.add(analysis, ensemble, out=analysis))
@@ -170,10 +175,11 @@ def enkf_exact(
     """
     anomalies = center_ensemble(ensemble)[1]
     predicted_anomalies = center_ensemble(predicted)[1]
-    # Orthogonal to both, so that no sample covariance with the draws enters P+.
+    # Orthogonal to both, so that no sample covariance with the draws enters P⁺.
     joint_anomalies = np.concatenate([anomalies, predicted_anomalies], axis=-1)
     draws = exact_noise(joint_anomalies, cholesky(noise), rng)
     gain = _solve_gain(anomalies, predicted_anomalies, noise)
+    # x_i + K (y* - h(x_i) - zeta_i).
     innovations = observed[..., None, :] - predicted - draws
     return np.asarray(ensemble + innovations @ gain)
 
@@ -243,8 +249,9 @@ def _rotate_members(anomalies: Array, rng: Rng) -> Array:
     from scipy.fft import dct
 
     n = anomalies.shape[-2]
-    # The reflection I - 2 v v' takes the direction of ones to the first unit vector and is its
-    # own inverse. The other coordinates are those of the centred members.
+    # The reflection I - 2 v v' takes the direction of ones, 1/√N, to the first unit vector e_1 for
+    # v = (e_1 - 1/√N) / |e_1 - 1/√N|, and is its own inverse. The other coordinates are those of
+    # the centred members.
     v = np.full(n, -1 / np.sqrt(n))
     v[0] += 1
     v /= np.linalg.norm(v)
@@ -293,6 +300,7 @@ def stochastic_forecast(
         # The noise of each member depends on its state.
         return model.sample_step(ensemble, t, dt, rng=rng)
     if model.periods:
+        # Angles stay on one branch, so that the members have a mean.
         forecast = step_members(model, ensemble, t, dt)
     else:
         forecast = model.step(ensemble, t, dt)
@@ -334,6 +342,7 @@ def exact_forecast(
             f"a {type(model).__name__}: use stochastic_forecast"
         )
     if model.periods:
+        # Angles stay on one branch, so that the members have a mean.
         forecast = step_members(model, ensemble, t, dt)
     else:
         forecast = model.step(ensemble, t, dt)
@@ -341,8 +350,9 @@ def exact_forecast(
     # Without noise nothing is drawn.
     if not root.any():
         return forecast
-    # An ensemble with a member that is not finite has no sample covariance. Its prior takes its
-    # place in the draws, so that the noise of the others does not depend on it.
+    # An ensemble with a member that is not finite has no sample covariance. Its prior stands in for
+    # it when the noise is drawn, so that the other ensembles get the noise that they would get
+    # anyway; the result is NaN.
     failed = ~np.isfinite(forecast).all(axis=(-2, -1), keepdims=True)
     finite = np.where(failed, ensemble, forecast)
     noisy = finite + exact_noise(center_ensemble(finite)[1], root, rng)

@@ -30,6 +30,11 @@ Bandwidth = Annotated[float, Bounds(above=0, at_most=1)]
 E = TypeVar("E", bound=np.generic)
 
 
+_FAR = 10
+"""An observation is far from all predictions if its squared distance is so many standard deviations
+above the mean."""
+
+
 class ParticleCollapse(RuntimeWarning):
     """A belief depends on few members: the others are copies, or have no weight."""
 
@@ -53,12 +58,15 @@ def effective_size(log_weights: ArrayLike) -> Array:
 
 
 def size_of(weights: Array) -> Array:
-    """Return the effective sample size of normalised weights."""
+    """Return the effective sample size 1 / Σ w² of weights (..., N) that sum to one."""
     return np.asarray(1 / (weights * weights).sum(axis=-1))
 
 
 def warn_of_collapse(problem: str, option: str) -> None:
-    """Warn the caller of a filter, or of an update, that a belief depends on few members."""
+    """Warn the caller of a filter, or of an update, that a belief depends on few members.
+
+    The message states the problem and names an option of the filter that helps.
+    """
     text = f"{problem}; use more members, {option}, or more process noise"
     warnings.warn(text, ParticleCollapse, stacklevel=4)
 
@@ -68,35 +76,66 @@ def warn_of_weights(
 ) -> None:
     """Warn if one member has all the weight, or the observation is far from all predictions.
 
-    >>> two = np.array([[0.0, -99.0], [0.0, 0.0]]), np.array([[[0.0], [1.0]]] * 2)
+    Far is ten standard deviations of the squared Mahalanobis distance above its mean.
+
+    Parameters
+    ----------
+    log_weights : ndarray, (..., N)
+        Log-weights of the members, in any normalisation.
+    predicted : ndarray, (..., N, m)
+        Each member's prediction of the observation.
+    observed : ndarray, (..., m)
+        The observation; NaN where there is none.
+    noise : ndarray, (m, m) or (..., m, m)
+        Covariance of the observation noise.
+
+    Examples
+    --------
+    The first of two members has all the weight:
+
+    >>> predicted = np.array([[0.0], [1.0]])
     >>> with warnings.catch_warnings(action="error"):
-    ...     warn_of_weights(*two, np.zeros((2, 1)), np.eye(1))
+    ...     warn_of_weights(np.array([0.0, -99.0]), predicted, np.zeros(1), np.eye(1))
     Traceback (most recent call last):
     distfilt.updates.particles.ParticleCollapse: an ensemble's weights have an effective size of ...
+
+    Equal weights in two ensembles. The first has no observation; in the second it is 9, where 0
+    and 1 are predicted:
+
+    >>> observed = np.array([[np.nan], [9.0]])
     >>> with warnings.catch_warnings(action="error"):
-    ...     warn_of_weights(0 * two[0], two[1], np.array([[np.nan], [9.0]]), np.eye(1))
+    ...     warn_of_weights(np.zeros((2, 2)), predicted, observed, np.eye(1))
     Traceback (most recent call last):
     distfilt.updates.particles.ParticleCollapse: an observation's squared distance from an ...
     """
     weights = np.exp(log_weights - log_sum_exp(log_weights))
-    least = size_of(weights).min(initial=np.inf)
-    if least < 1.1:
-        problem = f"an ensemble's weights have an effective size of {least:.1f}"
+    # The initial value is for a batch without ensembles.
+    smallest_size = size_of(weights).min(initial=np.inf)
+    # An effective size of 1.1 means that one member has 95 % of the weight.
+    if smallest_size < 1.1:
+        problem = f"an ensemble's weights have an effective size of {smallest_size:.1f}"
         warn_of_collapse(problem, "rejuvenation=")
         return
     m = observed.shape[-1]
-    largest = np.nanmax(_mahalanobis_squared(predicted, observed, noise), initial=0.0)
-    # It has a chi-squared distribution with mean m and variance 2 m: ten deviations.
-    if largest > m + 10 * np.sqrt(2 * m):
+    distances = _mahalanobis_squared(predicted, observed, noise)
+    largest_distance = np.nanmax(distances, initial=0.0)
+    # If the ensemble is consistent, the squared distance has a chi-squared distribution with m
+    # degrees of freedom: its mean is m, its variance 2 m. Ten of its deviations are so many that
+    # chance alone does not give a warning, even in a long run with heavier tails.
+    if largest_distance > m + _FAR * np.sqrt(2 * m):
         problem = (
             f"an observation's squared distance from an ensemble's predictions is "
-            f"{largest:.0f}, not {m}"
+            f"{largest_distance:.0f}, not {m}"
         )
         warn_of_collapse(problem, "rejuvenation=")
 
 
 def _mahalanobis_squared(predicted: Array, observed: Array, noise: Array) -> Array:
-    """Return the squared Mahalanobis distance of each observation from its predictions, (...)."""
+    """Return the squared Mahalanobis distance of each observation from its predictions, (...).
+
+    It is (y - ȳ)' (C + R)⁻¹ (y - ȳ), with the predictions' mean ȳ and covariance C. Shapes are
+    those of :func:`warn_of_weights`; the distance is NaN where a component is.
+    """
     mean = predicted.mean(axis=-2, keepdims=True)
     innovation = observed - mean[..., 0, :]
     anomalies = predicted - mean
@@ -107,7 +146,7 @@ def _mahalanobis_squared(predicted: Array, observed: Array, noise: Array) -> Arr
 
 def repeat_by_count(points: NDArray[E], counts: Indices) -> NDArray[E]:
     """Repeat the rows of points (..., N, d), each as often as its count (..., N), N in all."""
-    # Counts sum to N in every ensemble, so the repeated rows of a batch keep their places.
+    # Counts sum to N in every ensemble, so one call can repeat the rows of a whole batch.
     rows = points.reshape(-1, points.shape[-1])
     return np.repeat(rows, counts.reshape(-1), axis=0).reshape(points.shape)
 
@@ -140,21 +179,29 @@ def resample(probabilities: Annotated[Probabilities, "... n"], *, rng: Rng) -> I
     """
     offset = rng.random((*probabilities.shape[:-1], 1))
     counts = systematic_counts(probabilities, offset)
+    # Each index as a point of one component, repeated as often as it was drawn.
     indices = np.arange(counts.shape[-1])[:, None]
     each = np.broadcast_to(indices, (*counts.shape, 1))
     return np.asarray(repeat_by_count(each, counts)[..., 0])
 
 
 def systematic_counts(weights: Array, offset: Array) -> Indices:
-    """Return the number of levels (k + offset) / N in the interval of each weight (..., N)."""
+    """Return how often systematic resampling draws each particle, by its weight (..., N).
+
+    The weights divide [0, 1] into N intervals. A particle is drawn once for each of the levels
+    (k + offset) / N, k = 0, ..., N - 1, that lies in its interval. The offset (..., 1) is a uniform
+    number from 0 to 1.
+    """
     n = weights.shape[-1]
-    # The number of levels below each edge of the cumulative weights; the last edge has all.
+    # The ends of the intervals; rounding must not move the last one from 1.
     edges = weights.cumsum(axis=-1)
     edges /= edges[..., -1:].copy()
+    # (k + offset) / N < edge holds for ceil(N edge - offset) values of k, and all N lie below 1.
     edges *= n
     edges -= offset
     counts: Indices = np.ceil(edges, out=edges).astype(np.intp)
     counts[..., -1] = n
+    # Levels below an interval's end, less those below its start.
     counts[..., 1:] -= counts[..., :-1]
     return counts
 
@@ -208,7 +255,11 @@ def jitter(
 
 
 def silverman(n: int, d: int) -> float:
-    """Return Silverman's bandwidth for n particles of d components, at most one."""
+    """Return Silverman's bandwidth for n particles of d components, at most one.
+
+    In units of the standard deviation it is the best for a Gaussian kernel and a Gaussian density:
+    B. W. Silverman, Density Estimation for Statistics and Data Analysis (1986).
+    """
     bandwidth = (4 / (n * (d + 2))) ** (1 / (d + 4))
     return float(min(1.0, bandwidth))
 
@@ -220,11 +271,13 @@ def add_jitter(
     normal: Array,
     is_copy: Mask | None = None,
 ) -> Array:
-    """Add the noise of :func:`jitter`, made of standard normal draws.
+    """Add the noise of :func:`jitter` to points (..., N, d), made of standard normal draws.
 
-    If it is known which particles are copies, only they are changed: C. Musso, N. Oudjane,
-    F. Le Gland, in the same book, 247-271.
+    If `is_copy` (..., N) says which particles are copies of others, only they are moved, and not
+    shrunk towards the mean, as in C. Musso, N. Oudjane, F. Le Gland, in: Sequential Monte Carlo
+    Methods in Practice (2001) 247-271.
     """
+    # L xi_i with C = L L'.
     noise = normal @ factor(covariance).mT
     if is_copy is not None:
         moved = points + bandwidth * noise
@@ -238,17 +291,19 @@ def add_jitter(
 def reweight(
     log_weights: Array, predicted: Array, observed: Array, noise: Array
 ) -> Array:
-    """Return normalised log-weights (..., N) after an observation, by Bayes' rule.
+    """Return normalised log-weights (..., N) after an observation (..., m), by Bayes' rule.
 
-    Raises an error if all likelihoods are zero.
+    `predicted` (..., N, m) are the particles' predictions, `noise` (..., m, m) is the covariance of
+    the observation's noise. Raises an error if all likelihoods are zero.
     """
     # log w_i + log p(y | x_i), and the logarithm of their sum.
-    seen = log_likelihood(predicted, observed, noise, contradict=True)
-    joint = log_weights + seen
+    log_likelihoods = log_likelihood(predicted, observed, noise, contradict=True)
+    joint = log_weights + log_likelihoods
     total = log_sum_exp(joint)
     if not all_finite(total):
         raise ArithmeticError("every particle has a likelihood of zero")
-    # A weight of zero stays finite, so that minus infinity marks a failure only.
+    # The logarithm of a zero weight stays finite, though exp of it is zero: so minus infinity
+    # never gets into a state, and differences of logarithms are never NaN.
     return np.asarray(np.maximum(joint - total, -1e300))
 
 
@@ -269,10 +324,12 @@ def log_likelihood(
     covariance = noise
     contradicting: Mask | None = None
     if not all_finite(residual):
+        # NaN where the observation is missing, or a particle cannot predict it: (..., m, N).
         is_unseen = np.isnan(residual)
         missing = np.asarray(is_unseen.any(axis=-1))
         if contradict:
             missing = np.asarray(is_unseen.all(axis=-1))
+            # Particles that cannot predict a component which others can.
             contradicting = np.asarray((is_unseen & ~missing[..., None]).any(axis=-2))
             residual = np.where(is_unseen, 0.0, residual)
         # A missing component gets a zero residual and a unit variance of its own in R.
@@ -292,7 +349,7 @@ def log_likelihood(
 def log_normalizer(observed: Array, noise: Array) -> Array:
     """Return the constant that :func:`log_likelihood` leaves out, (...), of observations (..., m).
 
-    It counts the components that are not missing.
+    Missing components, which are NaN, do not count.
 
     >>> log_normalizer(np.array([[0.0, 0.0], [0.0, np.nan]]), np.eye(2)).round(4)
     array([-1.8379, -0.9189])
@@ -309,8 +366,9 @@ def log_normalizer(observed: Array, noise: Array) -> Array:
 def distinct_fraction(points: Array) -> Array:
     """Return the fraction of particles that differ from all others, (...).
 
-    They are compared in the component with the most changes from particle to particle. Mostly
-    that is the first, but it may be known exactly.
+    Points are (..., N, d), with copies of a particle one after another. They are compared in one
+    component only: the one that changes most often from one particle to the next. Any one would
+    do, but for those that are known exactly, in which all particles are equal.
 
     >>> exact_first = np.array([[0.0, 1.0], [0.0, 2.0]])
     >>> exact_last = np.array([[1.0, 0.0], [2.0, 0.0]])
@@ -322,7 +380,7 @@ def distinct_fraction(points: Array) -> Array:
     rows = np.ascontiguousarray(points.mT).reshape(-1, d, n)
     changes = (rows[..., 1:] != rows[..., :-1]).sum(axis=-1)
     chosen = rows[np.arange(len(rows)), changes.argmax(axis=-1)]
-    # Of equal values, neighbours once they are sorted, one counts.
+    # Sorted, equal values are neighbours: each increase is a new value.
     values = np.sort(chosen).reshape(*lead, n)
     increases = (values[..., 1:] > values[..., :-1]).sum(axis=-1)
     return np.asarray((1 + increases) / n)

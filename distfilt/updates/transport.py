@@ -36,7 +36,7 @@ Fit = Callable[[Array, Array], ConditionalMap]
 
 
 def _perturb(predicted: Array, noise: Array, factor: float, rng: Rng) -> Array:
-    """Add a draw of the noise, times a factor, to each prediction; with zero nothing is drawn."""
+    """Add a draw of the noise, times a factor, to predictions (..., N, m); none if it is zero."""
     if not factor:
         return predicted
     return perturb_observations(predicted, factor**2 * noise, rng)
@@ -72,8 +72,8 @@ def transport_map_update(
         ``fit(y, x) -> map``: an estimator of the map, such as
         :func:`distfilt.triangular.separable.fit` with its options.
     noise_factor : float
-        Factor of the drawn noise. All but one are mistakes; chapter 4 shows the effect of
-        zero and of a hundredth.
+        Factor of the drawn noise. Any other than 1 is a mistake; chapter 4 shows the effect of 0
+        and of 0.01.
 
     Examples
     --------
@@ -188,7 +188,9 @@ def etpf(
     rejuvenation: NonNegativeFloat = 0.0,
     cost: Literal["squared", "distance"] = "squared",
 ) -> Array:
-    r"""Weight the members by their likelihoods and transport them to equal weights, (3)-(5).
+    r"""Weight the members by their likelihoods and transport them to equal weights.
+
+    Equations (3)-(5) of Das and Bhattacharya.
 
     Reich's ensemble transform particle filter: only the observation's noise has to be Gaussian, and
     nothing is drawn.

@@ -23,6 +23,7 @@ from ..validation import (
     ArrayInput,
     Bounds,
     Indices,
+    Mask,
     NonNegativeFloat,
     PositiveFloat,
     Rng,
@@ -43,7 +44,7 @@ __all__ = [
 
 
 def _apply_after(update: Update, change: Callable[[Array], Array]) -> Update:
-    """Return an update followed by a change of the analysis members."""
+    """Return an update followed by a change of the analysis members (..., N, d)."""
 
     @wraps_update(update)
     def update_and_change(
@@ -56,7 +57,8 @@ def _apply_after(update: Update, change: Callable[[Array], Array]) -> Update:
         predict: Callable[[Array], Array] | None = None,
         observation_places: Array | None = None,
     ) -> Array:
-        # Only an update that repredicts takes a function `predict`, and only one by places them.
+        # Options that the inner update does not declare must not be passed to it: `predict` is for
+        # updates that predict anew after each observation, `observation_places` for localisation.
         options: dict[str, object] = {"rng": rng}
         if predict is not None:
             options["predict"] = predict
@@ -294,7 +296,7 @@ def serially(update: Update) -> Update:
     >>> float(after.mean().round(12)), float(after.var(ddof=1).round(12))
     (0.5, 0.25)
     """
-    return _one_by_one(update, None)
+    return _apply_in_turn(update, None)
 
 
 Periods = PositiveFloat | Annotated[ArrayInput, "k", ALLOW_NAN]
@@ -429,16 +431,20 @@ def with_localization(
                 "are those of sensors, got None"
             )
         _check_places(len(places), at.shape, d, m)
-        # Places of all components, and of predictions (see `serially`).
+        # Places of all components, and of predictions, which are further components of the state
+        # if they are not made again (see `serially`).
         lead = at.shape[:-2]
         components = np.broadcast_to(places, (*lead, *places.shape))
         points = np.concatenate([components, at], axis=-2)
+        # Distances from each point to each observation, along each of the k axes.
         distance = np.abs(points[..., :, None, :] - at[..., None, :, :])
         if periods is not None:
+            # On a ring the shorter of both ways round.
             distance = np.minimum(distance % periods, -distance % periods)
         return gaspari_cohn(np.linalg.norm(distance, axis=-1) / radius)
 
-    local = _one_by_one(update, find_taper)
+    local = _apply_in_turn(update, find_taper)
+    # Tags by which a filter finds out that it has to pass the places, and where a sensor is.
     vars(local).update(locates=True, locate=locate)
     return local
 
@@ -454,7 +460,10 @@ def find_locate(update: Update) -> Callable[[Sensor], Array] | None:
 
 
 def _check_periods(period: Array | float, k: int) -> Array:
-    """Return a positive period for each of k axes, infinity where a coordinate does not return."""
+    """Return a positive period for each of k axes, (k,), from one for all or one each.
+
+    It is infinite where a coordinate does not return.
+    """
     periods = np.broadcast_to(np.asarray(period, dtype=np.float64), (k,)).copy()
     periods[np.isnan(periods)] = np.inf
     if not (periods > 0).all():
@@ -468,6 +477,7 @@ def _make_locate(
     """Return a function that gives the places (sensor.dim, k) of a sensor's components."""
 
     def locate(sensor: Sensor) -> Array:
+        """Look the sensor up, or call the user's function; repeat one place for all components."""
         if isinstance(given, Mapping):
             if sensor not in given:
                 raise ValueError(
@@ -489,12 +499,17 @@ def _make_locate(
 
 
 def gaspari_cohn(ratio: Array) -> Array:
-    """Return the taper of covariances at ratios of distance to radius, zero from two on."""
+    """Return Gaspari and Cohn's taper of covariances at ratios (...) of distance to radius.
+
+    It falls from 1 at zero to 0 at two and beyond: equation (4.10) of their paper, cited by
+    :func:`with_localization`.
+    """
     r = np.asarray(ratio)
-    # (4.10): two polynomials of degree five, in Horner's form, that join smoothly at one.
+    # Two functions in Horner's form, polynomials of degree five but for a term in 1/r, that join
+    # smoothly at one.
     inside = 1 + r**2 * (-5 / 3 + r * (5 / 8 + r * (1 / 2 - r / 4)))
     outside = 4 + r * (-5 + r * (5 / 3 + r * (5 / 8 + r * (-1 / 2 + r / 12))))
-    # At zero the other polynomial is used.
+    # At r = 0 this is infinite, but there the other one is used.
     with np.errstate(divide="ignore"):
         outside = outside - 2 / (3 * r)
     return np.asarray(np.where(r <= 1, inside, np.where(r < 2, outside, 0.0)))
@@ -507,10 +522,10 @@ Taper = Callable[[int, int, Array | None], Array]
 """``taper(d, m, observation_places)``: the factors of the changes, (..., d + m, m)."""
 
 
-def _one_by_one(update: Update, find_taper: Taper | None) -> Update:
-    """Return an update by groups of correlated observations in turn.
+def _apply_in_turn(update: Update, find_taper: Taper | None) -> Update:
+    """Return an update by groups of correlated observations, one after the other.
 
-    The changes by each observation are multiplied by its column of a taper.
+    With a taper, the changes by each observation are multiplied by its column of it.
     """
 
     @wraps_update(update)
@@ -534,29 +549,35 @@ def _one_by_one(update: Update, find_taper: Taper | None) -> Update:
         present = np.where(is_predicted, observed, np.nan)
         turns = _plan_turns(present, noise, taper)
         for number, turn in enumerate(turns):
-            # The first group meets the filter's own predictions.
+            # The first group uses the filter's own predictions, later ones those of moved members.
             if predict is not None and number:
                 predicted = call_user(predict, ensemble)
             state = ensemble
-            # Predictions that are not made again move along, as components d to d + m.
+            # Without `predict` the predictions are updated too, as components d to d + m of the
+            # state. For linear sensors and an update by a gain that is the same as to predict anew.
             if predict is None:
                 state = np.concatenate([ensemble, predicted], axis=-1)
             analysis = turn.apply(update, state, predicted, taper, rng)
-            # The next group starts from here.
+            # The analysis of this group is the forecast of the next.
             ensemble = analysis[..., :d]
             if predict is None:
                 predicted = analysis[..., d:]
         return ensemble
 
     vars(update_in_turn)["repredicts"] = True
-    # Every observation keeps its column of the taper, also where others are missing.
+    # The update takes NaN for missing observations itself: with a taper they must stay in the
+    # array, so that every observation keeps its column of the taper.
     vars(update_in_turn)["accepts_missing"] = find_taper is not None
     return update_in_turn
 
 
 @dataclass(frozen=True)
 class _Group:
-    """Observations that are assimilated together: correlated ones, or a single one."""
+    """Observations that are assimilated together: correlated ones, or a single one.
+
+    `indices` (g,) are their places among the m observations; `observed` (..., m) and `noise`
+    (..., m, m) are those of all m.
+    """
 
     indices: Indices
     observed: Array
@@ -570,7 +591,12 @@ class _Group:
         taper: Array | None,
         rng: Rng,
     ) -> Array:
-        """Return the state after the observations, its changes multiplied by their taper."""
+        """Return the state (..., N, k) after the observations, its changes multiplied by the taper.
+
+        The state has d components, and behind them m predictions if these are updated too. So has
+        the taper of localisation, (..., d + m, m), which is 1 near an observation and 0 far from
+        it. `predicted` is (..., N, m).
+        """
         group = self.indices
         analysis = with_missing(
             update,
@@ -582,16 +608,17 @@ class _Group:
         )
         if taper is None:
             return np.asarray(analysis)
-        # x <- x + rho (x' - x); all columns of the group are the same.
+        # x <- x + rho (x' - x). Observations of a group have one place, and so equal columns.
         rho = taper[..., None, : state.shape[-1], group[0]]
         return np.asarray(state + rho * (analysis - state))
 
 
 @dataclass(frozen=True)
 class _Mixture:
-    """One of several correlated observations in different places, after whitening.
+    """A combination of correlated observations in different places, made by whitening.
 
-    It is sum_j w_j y_j with noise of unit variance.
+    Its value is sum_j w_j y_j over the g observations `indices`; its noise has unit variance and is
+    independent of that of the other combinations.
     """
 
     indices: Indices
@@ -608,31 +635,38 @@ class _Mixture:
         taper: Array | None,
         rng: Rng,
     ) -> Array:
-        """Return the state after the observation, with the covariances multiplied by the taper."""
+        """Return the state after the observation, with the covariances multiplied by the taper.
+
+        The combination z = sum_j w_j h_j has no place of its own. Each part h_j keeps its taper:
+        the covariance of component k and z becomes sum_j w_j rho_kj cov(x_k, h_j), and the variance
+        of z becomes sum_ij w_i w_j rho_ij cov(h_i, h_j). Arguments are those of
+        :meth:`_Group.apply`.
+        """
+        # Combinations are made only where there is a taper, (..., d + m, m).
         local = cast(Array, taper)
         rho = local[..., self.indices]
+        d = local.shape[-2] - local.shape[-1]
+        # d, or d + m if the predictions are components of the state too.
         n_state = state.shape[-1]
-        d = rho.shape[-2] - local.shape[-1]
         weights = self.weights[..., None, :]
-        parts = predicted[..., self.indices]
-        # A missing observation has no weight in any other.
-        parts = np.where(np.broadcast_to(weights != 0, parts.shape), parts, 0.0)
-        is_predicted = np.asarray(np.isfinite(parts).all(axis=(-2, -1)))
-        parts = np.where(is_predicted[..., None, None], parts, 0.0)
+        parts, is_predicted = self._select_parts(predicted)
         mixed = (weights * parts).sum(axis=-1, keepdims=True)
         # Anomalies, and their products summed over the members.
         x = state - state.mean(axis=-2, keepdims=True)
         h = parts - parts.mean(axis=-2, keepdims=True)
         z = mixed - mixed.mean(axis=-2, keepdims=True)
-        # sum_j w_j rho_kj cov(x_k, h_j), and the mixture's tapered variance.
+        # sum_j w_j rho_kj cov(x_k, h_j), and the mixture's tapered variance, (...). The rows d and
+        # on of the taper are those of the observations. All are N - 1 times (co)variances.
         local_cov = (rho[..., :n_state, :] * weights * (x.mT @ h)).sum(axis=-1)
-        between = rho[..., d + self.indices, :]
-        products = weights.mT * weights * between * (h.mT @ h)
+        rho_between = rho[..., d + self.indices, :]
+        products = weights.mT * weights * rho_between * (h.mT @ h)
         local_variance = np.maximum(products.sum(axis=(-2, -1)), 0.0)
         variance = (z * z).sum(axis=(-2, -1))
+        # Without variance there is no gain; NaN leaves the ensemble as it is.
         is_used = (variance > 0) & (local_variance > 0) & is_predicted
         target = np.where(is_used, self.value, np.nan)[..., None]
-        # The update meets a prediction with the tapered variance, as a component of the state.
+        # The update gets a prediction that is scaled to the tapered variance. It is also appended
+        # to the state, so that its own change is known afterwards.
         ratio = np.ones_like(variance)
         np.divide(local_variance, variance, out=ratio, where=is_used)
         z = np.sqrt(ratio)[..., None, None] * z
@@ -640,36 +674,67 @@ class _Mixture:
         extended = np.concatenate([state, tapered], axis=-1)
         analysis = with_missing(update, extended, tapered, target, np.eye(1), rng=rng)
         change = analysis - extended
-        # A gain changes member i by c_i cov(x, z), so that c_i follows from the change of z.
-        unit = np.where(is_used, local_variance, 1.0)[..., None, None]
-        c = change[..., n_state:] / unit
-        rest = change[..., :n_state] - c * (x.mT @ z).mT
-        # An update that is not by a gain leaves a rest, which has no parts.
+        # An update by a gain changes member i by c_i cov(x, z) in every component, and z itself by
+        # c_i var(z). That gives c_i, and the state then moves by the tapered covariance.
+        divisor = np.where(is_used, local_variance, 1.0)[..., None, None]
+        c = change[..., n_state:] / divisor
+        by_gain = c * local_cov[..., None, :]
+        # Other updates change the state by more than that. This remainder cannot be divided among
+        # the parts j, so it gets their mean taper.
+        remainder = change[..., :n_state] - c * (x.mT @ z).mT
+        mean_rho = self._average_taper(rho[..., :n_state, :])
+        return np.asarray(state + by_gain + mean_rho[..., None, :] * remainder)
+
+    def _select_parts(self, predicted: Array) -> tuple[Array, Mask]:
+        """Return the g predictions (..., N, g) that are combined, and whether they exist (...).
+
+        A prediction that does not exist is NaN. It does no harm if its observation is missing too,
+        which has weight zero in the combinations of the others. Otherwise the combination is not
+        observed, and all its predictions become zero.
+        """
+        parts = predicted[..., self.indices]
+        has_weight = np.broadcast_to(self.weights[..., None, :] != 0, parts.shape)
+        parts = np.where(has_weight, parts, 0.0)
+        is_predicted = np.asarray(np.isfinite(parts).all(axis=(-2, -1)))
+        return np.where(is_predicted[..., None, None], parts, 0.0), is_predicted
+
+    def _average_taper(self, rho: Array) -> Array:
+        """Return the mean (..., k) of the parts' tapers rho (..., k, g), weighted by w_j²."""
+        weights = self.weights[..., None, :]
         squares = weights * weights
-        share = (rho[..., :n_state, :] * squares).sum(axis=-1) / squares.sum(axis=-1)
-        return np.asarray(
-            state + c * local_cov[..., None, :] + share[..., None, :] * rest
-        )
+        return np.asarray((rho * squares).sum(axis=-1) / squares.sum(axis=-1))
 
 
 def _plan_turns(
     observed: Array, noise: Array, taper: Array | None
 ) -> list[_Group | _Mixture]:
-    """Return what is assimilated in turn: groups in one place, and whitened observations."""
+    """Return what is assimilated in turn: groups in one place, and whitened observations.
+
+    Observations are (..., m), their noise covariance (..., m, m), the taper (..., d + m, m).
+    """
     turns: list[_Group | _Mixture] = []
     rounding = 0.0 if taper is None else _ROUNDING
     for group in _group_correlated(noise, rounding):
-        columns = None if taper is None else taper[..., group]
-        # All observations of a group are in one place, or there are no places.
-        if columns is None or (columns == columns[..., :1]).all():
+        # Observations in one place have the same taper: they can be assimilated together, as all
+        # can be without a taper.
+        if taper is None:
+            is_one_place = True
+        else:
+            columns = taper[..., group]
+            is_one_place = bool((columns == columns[..., :1]).all())
+        if is_one_place:
             turns.append(_Group(group, observed, noise))
-            continue
-        turns.extend(_whiten(group, observed[..., group], noise))
+        else:
+            turns.extend(_whiten(group, observed[..., group], noise))
     return turns
 
 
 def _whiten(group: Indices, observed: Array, noise: Array) -> list[_Mixture]:
-    """Return mixtures of correlated observations that have independent noise of unit variance."""
+    """Return g mixtures of g correlated observations, with independent noise of unit variance.
+
+    `group` (g,) are their indices, `observed` (..., g) their values, NaN where missing; `noise`
+    (..., m, m) is the covariance of all.
+    """
     g = group.size
     covariance = noise[..., group[:, None], group]
     missing = np.isnan(observed)
@@ -700,18 +765,21 @@ def _check_places(n_state: int, shape: tuple[int, ...], d: int, m: int) -> None:
 
 
 def _group_correlated(noise: Array, rounding: float = 0.0) -> list[Indices]:
-    """Return the indices of observations with correlated noise, in the order of their first.
+    """Return the indices of each group of observations with correlated noise.
 
-    Correlations up to `rounding` do not count.
+    Groups are in the order of their first observations. `noise` (..., m, m) is the covariance of
+    all; correlations up to `rounding` do not count.
     """
     from scipy.sparse import csgraph, csr_array
 
-    # Over a batch: observations that are correlated in any of its covariances stay together.
     stds = np.sqrt(np.diagonal(noise, axis1=-2, axis2=-1))
     least = rounding * stds[..., :, None] * stds[..., None, :]
-    correlated = np.abs(noise) > least
-    in_any = correlated.reshape(-1, *noise.shape[-2:]).any(axis=0)
+    is_correlated = np.abs(noise) > least
+    # Over a batch: observations that are correlated in any of its covariances stay together.
+    in_any = is_correlated.reshape(-1, *noise.shape[-2:]).any(axis=0)
     # Groups are the connected components of the graph of correlations.
     graph = csr_array(in_any)
     labels = csgraph.connected_components(graph, directed=False)[1]
-    return [np.flatnonzero(labels == label) for label in dict.fromkeys(labels.tolist())]
+    # Each label once, in the order in which they first come.
+    distinct_labels = dict.fromkeys(labels.tolist())
+    return [np.flatnonzero(labels == label) for label in distinct_labels]

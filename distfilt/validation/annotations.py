@@ -134,6 +134,7 @@ class ArgumentConstraint:
 
 
 def _convert_float(value: object, name: str, context: CallContext) -> float:
+    """Return a finite real number as a float; TypeError for anything else."""
     # These types need no array; all others go through its conversion, which refuses most.
     try:
         if isinstance(value, float | int) and not isinstance(value, bool):
@@ -148,6 +149,7 @@ def _convert_float(value: object, name: str, context: CallContext) -> float:
 
 
 def _convert_int(value: object, name: str, context: CallContext) -> int:
+    """Return an integer of Python or numpy as an int; TypeError for anything else."""
     # A bool is an int in Python, and a timedelta an integer in numpy.
     if isinstance(value, bool | np.timedelta64):
         raise TypeError
@@ -157,12 +159,14 @@ def _convert_int(value: object, name: str, context: CallContext) -> int:
 
 
 def _convert_bool(value: object, name: str, context: CallContext) -> bool:
+    """Return True or False, of Python or numpy, as a bool; TypeError for anything else."""
     if not isinstance(value, bool | np.bool_):
         raise TypeError
     return bool(value)
 
 
 def _check_text(value: object, name: str, context: CallContext) -> str:
+    """Return a string that is not blank; TypeError for anything else."""
     if not isinstance(value, str) or not value.strip():
         raise TypeError
     return value
@@ -171,12 +175,14 @@ def _check_text(value: object, name: str, context: CallContext) -> str:
 def _check_instance(
     cls: type, value: object, name: str, context: CallContext
 ) -> object:
+    """Return an instance of a class; TypeError for anything else."""
     if not isinstance(value, cls):
         raise TypeError
     return value
 
 
 def _check_callable(value: object, name: str, context: CallContext) -> object:
+    """Return a function; the options of a partial of a validated function are checked here."""
     if not callable(value):
         raise TypeError
     if not isinstance(value, partial):
@@ -192,6 +198,7 @@ def _check_callable(value: object, name: str, context: CallContext) -> object:
 def _check_option(
     options: tuple[object, ...], value: object, name: str, context: CallContext
 ) -> object:
+    """Return a value that equals one of the options; TypeError for any other."""
     for option in options:
         # Types are compared first: 1 == True, and an array compares entry by entry.
         if type(value) is type(option) and value == option:
@@ -207,9 +214,10 @@ def _convert_array(
     name: str,
     context: CallContext,
 ) -> Array | Mask | Indices:
-    """Return an array of a dtype and shape.
+    """Return an array of real numbers, booleans or integers, by its dtype, of a declared shape.
 
-    :meth:`ArgumentConstraint.validate` gives a bare TypeError its message.
+    A wrong type raises a TypeError without a message, which :meth:`ArgumentConstraint.validate`
+    writes.
     """
     if dtype is np.float64:
         array: Array | Mask | Indices = check_array(value, name, finite=not allow_nan)
@@ -234,7 +242,10 @@ def _convert_array(
 
 
 def _find_column(shape: tuple[int, ...], context: CallContext) -> str:
-    """Return which earlier argument is a column vector that made another shape look wrong."""
+    """Return a hint at an earlier argument whose column of numbers made this shape look wrong.
+
+    A column (n, 1) has bound the size of an axis to 1, where n was meant. Without one return "".
+    """
     for name, value in context.arguments.items():
         column = np.shape(value) if isinstance(value, np.ndarray | list) else ()
         # A vector of n numbers as (n, 1), beside an array with axes of n.
@@ -246,6 +257,7 @@ def _find_column(shape: tuple[int, ...], context: CallContext) -> str:
 def _convert_sequence(
     entry: ArgumentConstraint | None, value: object, name: str, context: CallContext
 ) -> tuple[object, ...]:
+    """Return a sequence of any length as a tuple, each entry as its constraint converts it."""
     entries = _to_tuple(value)
     if entry is None:
         return entries
@@ -258,6 +270,7 @@ def _convert_tuple(
     name: str,
     context: CallContext,
 ) -> tuple[object, ...]:
+    """Return a sequence as a tuple that has one entry for each constraint, converted by it."""
     entries = _to_tuple(value)
     if len(entries) != len(constraints):
         raise ValueError(
@@ -285,6 +298,7 @@ def _convert_union(
     name: str,
     context: CallContext,
 ) -> object:
+    """Return the value as the first alternative converts it that takes it; None if `optional`."""
     if value is None and optional:
         return None
     for constraint in alternatives:
@@ -451,4 +465,5 @@ def _describe(constraints: Iterable[ArgumentConstraint | None], separator: str) 
 
 
 def _have_shape(constraints: Iterable[ArgumentConstraint | None]) -> bool:
+    """Whether any of the constraints declares the shape of an array."""
     return any(c is not None and c.has_shape for c in constraints)

@@ -26,7 +26,8 @@ class HasDimension(Protocol):
         """Length of the function's result."""
 
 
-# Largest difference between batched and single results, relative to the state's change.
+# Largest difference between batched and single results, relative to the state's change: solvers of
+# adaptive step differ by less, wrong rows by as much as the change itself.
 _RELATIVE_TOLERANCE = 1e-2
 
 
@@ -153,7 +154,10 @@ def _refuse_draws(name: str, first: Result, second: Result) -> None:
 
 
 def _is_conclusive(x: Array) -> bool:
-    """Whether equal results could not come from equal states or equal components."""
+    """Whether states x (..., d) differ so that a function that mixes rows would give it away.
+
+    If all states are equal, or all components of a single one, a wrong function passes by chance.
+    """
     rows = x.reshape(-1, x.shape[-1])
     if len(rows) > 1:
         return bool((rows[0] != rows[-1]).any())
@@ -181,7 +185,8 @@ def _is_different(row: Array, single: Result, states: Sequence[Array]) -> bool:
     if isinstance(single, Exception) or single.shape != row.shape:
         # A function for two axes fails on one state; it may get three axes later.
         return isinstance(single, IndexError)
-    # Solvers of adaptive step differ a little; wrong rows differ as much as the states change.
+    # The change of the state, if the function returns a state, or its value. A bound of 1e-9 of the
+    # value is added, for rounding where nothing changes.
     change = single
     if single.shape == states[0].shape:
         change = single - states[0]

@@ -187,6 +187,7 @@ def match_shape(
     for dimension in reversed(expected):
         if dimension is ...:
             return True
+        # An axis that is missing has the size -1, which fits nothing.
         size = remaining.pop() if remaining else -1
         if isinstance(dimension, str):
             # Numbers of components, in lower case, are at least 1.
@@ -225,6 +226,7 @@ def format_number(value: float) -> str:
     >>> format_number(0.1 + 0.2), format_number(1.7e9 + 0.25), format_number(1e300)
     ('0.3', '1700000000.25', '1e+300')
     """
+    # Six digits serve below 1e5; from 1e14 on a float has no decimals worth writing.
     if not 1e5 <= abs(value) < 1e14:
         return f"{value:g}"
     return f"{value:.6f}".rstrip("0").rstrip(".")
@@ -258,7 +260,7 @@ def check_positive_semidefinite(value: Array, name: str) -> None:
     # A noise that leaves some components alone has zeros there, which need no look.
     if _has_cholesky(_drop_constants(value)):
         return
-    # Rounding alone may have made an eigenvalue negative.
+    # Rounding alone may have made an eigenvalue negative, by 1e-9 of the variances at most.
     smallest = _smallest_eigenvalues(value)
     if smallest.min() < -_ROUNDING:
         _raise_not_positive(value, name, smallest, "semidefinite")
@@ -311,7 +313,7 @@ def _has_cholesky(value: Array) -> bool:
 
 
 def _drop_constants(value: Array) -> Array:
-    """Return a single matrix without the rows and columns that are zero; others as they are.
+    """Return a single matrix without the rows and columns that are zero; a stack as it is.
 
     >>> _drop_constants(np.diag([2.0, 0.0]))
     array([[2.]])
@@ -370,6 +372,7 @@ def check_probabilities(value: Array, name: str) -> None:
     error = np.abs(total - 1)
     # Strict, since for states far from zero a small missing weight moves the mean.
     largest = error.max(initial=0.0)
+    # Beyond 1e-4 the weights are wrong; below it they have been rounded, as to single precision.
     if largest > 1e-9:
         got = total[error.argmax()]
         if largest > 1e-4:

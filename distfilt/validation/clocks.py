@@ -48,6 +48,7 @@ def warn_of_clock(start: float, times: Array, name: str) -> None:
     if not is_long:
         return
     date = ""
+    # Up to the year 2286 it may be a Unix time, in s; a larger number is in another unit.
     if _LONG < first < 1e10:
         day = datetime.fromtimestamp(first, UTC).date()
         date = f" ({day} if it is a Unix time)"

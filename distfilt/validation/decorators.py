@@ -79,9 +79,11 @@ class SignatureConstraints:
     ) -> dict[str, object]:
         """Return the converted arguments by name, or raise an error for the first wrong one."""
         arguments = dict(zip(self.positional_names, args, strict=False)) | options
+        # Fewer names than arguments: `zip` has dropped some, as there are too many by position, or
+        # one is given both by position and by name.
         if len(arguments) < len(args) + len(options):
             self._refuse_positions(args)
-            # One of the arguments twice: Python's own error says which.
+            # Python's own error says which argument is given twice.
             signature(self.function).bind(*args, **options)
         # Shapes may refer to defaults too, which are not checked.
         context = CallContext(self.defaults | arguments)
@@ -303,7 +305,7 @@ class FrozenModel:
     """Whether the constructor checked this instance; not if the library constructed it."""
 
     def __post_init__(self) -> None:
-        # mypy does not take a class for hashable, as the cache asks for.
+        # The cast is for mypy: `field_constraints` is cached, so its argument must be hashable.
         cls = cast(Hashable, type(self))
         context = CallContext(dict(vars(self)))
         # Shapes refer to fields by name, as they do to arguments in a call.
@@ -340,9 +342,10 @@ class FrozenModel:
 def _fields(
     cls: type[FrozenModel],
 ) -> tuple[tuple[str, ...], tuple[tuple[str, Callable[[], object]], ...]]:
-    """Return the names of a dataclass's fields, and the factories of defaults by name.
+    """Return the names of a dataclass's fields, and (name, factory) of those with a factory.
 
-    A default that is no factory is an attribute of the class, so that instances need none.
+    A factory makes a field's default, anew for each instance. A default that is no factory is an
+    attribute of the class, so that instances need none.
     """
     names = []
     factories = []
@@ -356,7 +359,10 @@ def _fields(
 
 @cache
 def field_constraints(cls: type[FrozenModel]) -> dict[str, ArgumentConstraint]:
-    """Return the constraints of a dataclass's fields, inherited ones included, arrays last."""
+    """Return the constraints of a dataclass's fields by name, inherited ones included.
+
+    Those of arrays are last, as their shapes may refer to other fields.
+    """
     dataclass = cast(Hashable, cls)
     names, _ = _fields(dataclass)
     constraints: dict[str, ArgumentConstraint] = {}
@@ -364,6 +370,8 @@ def field_constraints(cls: type[FrozenModel]) -> dict[str, ArgumentConstraint]:
     for base in reversed(cls.__mro__):
         annotations = get_annotations(base)
         declared = {name: annotations[name] for name in annotations if name in names}
+        # The names that annotations may use; a class made in a shell may have no module, and any
+        # module then serves for the built-in names.
         module_names = vars(sys.modules.get(base.__module__, sys))
         constraints |= make_constraints(
             declared, base.__module__, module_names, base.__qualname__

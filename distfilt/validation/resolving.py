@@ -98,4 +98,5 @@ _IMPORTS = (ast.Import, ast.ImportFrom)
 
 
 def _is_type_checking(test: ast.expr) -> bool:
+    """Whether the condition of an `if` is TYPE_CHECKING."""
     return ast.unparse(test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING")
