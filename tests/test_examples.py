@@ -143,15 +143,43 @@ def test_radios_lead_from_a_file_to_a_table(
     )
     monkeypatch.setattr(sys, "argv", ["radios.py", str(path)])
     runpy.run_path(str(FOLDER / "radios.py"), run_name="__main__")
-    # name, RMSE, "m", "NEES", NEES
-    lines = [line.rsplit(maxsplit=4) for line in capsys.readouterr().out.splitlines()]
-    rows = {
-        name.strip(): (float(rmse), float(nees)) for name, rmse, _, _, nees in lines
-    }
+    # A head, and a row for each rule: position, heading and NEES.
+    head, *lines = capsys.readouterr().out.splitlines()
+    assert head.split() == ["position", "heading", "nees"]
+    rows = {}
+    for line in lines:
+        name, position, _, nees = line.rsplit(maxsplit=3)
+        rows[name.strip()] = (float(position), float(nees))
     assert rows["all observations"][0] == min(rmse for rmse, _ in rows.values())
     assert 0.2 < rows["all observations"][1] < 1.5
     assert rows["naive fusion"][1] > 10
     assert rows["intersection"][1] < 1.5
+
+
+def test_landmarks_lead_from_folders_to_a_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With Gaussian noise alone, the filter that assumes it is accurate and consistent."""
+    for seed in (1, 2):
+        datasets.write_utias(
+            tmp_path / f"set{seed}",
+            rng=np.random.default_rng(seed),
+            duration=40.0,
+            defects=datasets.Defects.none(),
+        )
+    folders = [str(tmp_path / "set1"), str(tmp_path / "set2")]
+    monkeypatch.setattr(sys, "argv", ["landmarks.py", *folders])
+    # The program assumes a lag; the set has none.
+    names = runpy.run_path(str(FOLDER / "landmarks.py"))
+    assert names["SETTING"]["lag"] == 0.1
+    runpy.run_path(str(FOLDER / "landmarks.py"), run_name="__main__")
+    head, *lines = capsys.readouterr().out.splitlines()
+    assert head.split() == ["position", "heading", "nees", "place", "place_nees"]
+    assert [line.split()[0] for line in lines] == folders
+    for line in lines:
+        position, heading, nees, place, _ = map(float, line.split()[1:])
+        assert position < 0.12 and heading < 0.1 and place < 0.2
+        assert 0.1 < nees < 3
 
 
 def test_recipes_agree_with_values_from_elsewhere(

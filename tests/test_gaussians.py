@@ -255,6 +255,30 @@ def test_monotone_steps_alone_reach_the_optimum(
     assert np.allclose(w, exact, atol=0.02)
 
 
+@pytest.mark.parametrize("rule", ["min_trace", "min_determinant"])
+def test_a_monotone_step_never_increases_the_objective(rule: str) -> None:
+    """tr M⁻¹ or det M⁻¹ of M = Σ ω_b P_b⁻¹, before and after; of scales that differ by e³."""
+    rng = generator(4)
+    scales = np.exp(3 * rng.standard_normal((2000, 3, 1, 1)))
+    covs = spd(rng, 2, (2000, 3)) * scales
+    weights = rng.dirichlet(np.ones(3), 2000)
+    is_determinant = rule == "min_determinant"
+    present = np.ones((2000, 3))
+    problem = intersection._Problem.build(covs, present, is_determinant)
+    _, slope, _ = problem.derivatives(weights)
+    mean = (weights * slope).sum(axis=-1, keepdims=True)
+    after = problem.monotone_step(weights, slope, mean)
+    sizes = []
+    for w in (weights, after):
+        information = (w[..., None, None] * np.linalg.inv(covs)).sum(axis=1)
+        fused = np.linalg.inv(information)
+        trace = np.trace(fused, axis1=-2, axis2=-1)
+        sizes.append(np.linalg.det(fused) if is_determinant else trace)
+    assert (sizes[1] <= sizes[0] * (1 + 1e-9)).all()
+    # Almost all of them decrease it.
+    assert (sizes[1] < sizes[0]).mean() > 0.99
+
+
 def test_optimal_weights_of_crossed_repeated_and_dominated_sources() -> None:
     first = np.diag([1.0, 4.0])
     second = np.diag([4.0, 1.0])

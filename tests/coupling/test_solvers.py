@@ -130,6 +130,29 @@ def test_tiny_masses_do_not_make_a_problem_infeasible() -> None:
     assert plan.duality_gap < 1e-6
 
 
+@pytest.mark.parametrize("forbidden", [1e13, 1e17])
+def test_a_dear_link_that_is_needed_is_used_beside_forbidden_ones(
+    forbidden: float,
+) -> None:
+    """A mass of 1e-9 has to travel to 1e4, at a cost of 1e8, and others by about one.
+
+    On a line the monotone plan is optimal; links that it does not use may cost anything.
+    """
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal(30)
+    y = rng.standard_normal(30)
+    x[0] = 1e4
+    a = np.full(30, (1 - 1e-9) / 29)
+    a[0] = 1e-9
+    exact = monotone_plan(x, y, a)
+    cost = squared_distances(x[:, None], y[:, None])
+    is_unused = exact.matrix == 0
+    cost[is_unused & (rng.random(cost.shape) < 0.1)] = forbidden
+    plan = transport_plan(cost, a)
+    # The gap that is documented, relative to the cost
+    assert abs(plan.value - exact.value) < 1e-6 * exact.value
+
+
 @pytest.mark.parametrize(
     ("limit", "value", "solver", "message"),
     [

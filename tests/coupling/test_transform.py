@@ -87,6 +87,18 @@ def test_weights_that_underflow_and_weights_of_zero() -> None:
     assert np.abs(copies - x[7]).max() < 1e-13
 
 
+def test_a_far_member_of_hardly_any_weight_counts_in_the_mean() -> None:
+    """A weight of 5e-16 at 1e9 moves the mean of members about one by 5e-7."""
+    x = _rng(22).standard_normal((21, 1))
+    x[-1] = 1e9
+    weights = np.append(np.linspace(1.0, 2.0, 20), 30 * 5e-16)
+    weights /= weights.sum()
+    transformed = coupling.transform_ensemble(x, np.log(weights))
+    # By exact sums: of the members nearby, and of the far one
+    mean = weights[:-1] @ x[:-1, 0] + weights[-1] * 1e9
+    assert abs(transformed.mean() - mean) < 1e-9
+
+
 def test_ensembles_that_the_transform_does_not_change() -> None:
     """Equal weights, one member, and members that coincide."""
     x, _, _ = _case(4)

@@ -128,7 +128,7 @@ def test_a_prior_s_defaults_scale_with_the_box() -> None:
     """A length of a tenth of its side, 10, and a deviation of its mean density, 1/100."""
     grid = Grid((12, 12), high=[20.0, 5.0])
     expected = zero_mean_prior(grid, rank=20, length=1.0, std=0.01)
-    assert np.allclose(zero_mean_prior(grid, rank=20), expected, rtol=1e-12)
+    assert np.allclose(zero_mean_prior(grid, rank=20), expected, rtol=1e-12, atol=1e-16)
 
 
 @pytest.mark.parametrize(

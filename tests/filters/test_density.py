@@ -146,9 +146,13 @@ def test_agents_that_go_are_left_out_and_their_filters_go_on() -> None:
     assert largest(state.observed[0] - want) < 1e-13
     assert state.parts == 1
     assert np.isfinite(state.estimates).all()
-    # Without observations the filter of agent 5 loses information.
+    # The filter of agent 5 gets no more information than it had when the agent left.
     information = state.filters.information
     assert np.trace(information[5]) < np.trace(information[4])
+    until_then = last(
+        make(COMPLETE, density.Centralised(), initial_density=FLAT), path[:4]
+    )
+    assert np.array_equal(information[5], until_then.filters.information[5])
     # An agent that is missing from the start is in no average either.
     gone = START.copy()
     gone[0] = np.nan

@@ -483,6 +483,24 @@ def test_nees_of_a_collapsed_cloud_is_infinite() -> None:
     assert abs(recorded[0, 1] - nees) < 1e-9
 
 
+def test_a_spread_that_overflows_leaves_other_runs_their_nees() -> None:
+    # The second run's members are finite with mean zero; their squares are not finite.
+    walk = still_model(2, rate=1.0)
+    f = filters.EnsembleFilter(walk, [None], members=4, on_error="keep")
+    members = default_rng(1).standard_normal((2, 4, 2))
+    members[1] = 1e200 * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
+    state = f.start(members[:, None], rng=default_rng(0), runs=(2,))
+    with np.errstate(over="ignore", invalid="ignore"):
+        run = f.run(state, [1.0], [None], truth=np.zeros((1, 2, 2)))
+    assert np.isfinite(run["mean"].values).all()
+    assert np.isnan(run["nees"].values[0, 1]).all()
+    # NEES = eᵀ P⁻¹ e with the sample covariance of the first run's members
+    last_members = f.final_state(run).ensembles[0, 0]
+    error = last_members.mean(axis=0)
+    nees = error @ np.linalg.solve(np.cov(last_members.T), error)
+    assert np.allclose(run["nees"].values[0, 0], nees, rtol=1e-9, atol=0)
+
+
 class EverythingKnown(filters.GaussianFilter):
     """Gaussian filters whose agents get the observations of all of them."""
 

@@ -6,6 +6,8 @@ Every family runs on one problem without symmetries. Source: own.
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,6 +64,68 @@ def test_a_batch_loses_the_messages_of_its_runs(name: str) -> None:
 
 
 @ignore_collapse
+@pytest.mark.parametrize("name", [n for n, case in CASES.items() if case.runs])
+def test_the_number_of_runs_changes_no_loss(name: str) -> None:
+    """The second run of two and of three loses the same messages, and not those of the first."""
+    case = CASES[name]
+    if case.prior == "common members":
+        pytest.skip("members in common need every message")
+    problem = problem_of(case, runs=3)
+    faults = Faults(loss=0.4, seed=2)
+    three = record(case, problem, runs=3, faults=faults)
+    first_two = [replace(e, value=e.value[:2]) for e in problem.events]
+    two = record(case, replace(problem, events=first_two), runs=2, faults=faults)
+    assert_equal(three.isel(run=slice(2)), two)
+    # The second run, without its losses, is another one.
+    perfect = record(case, replace(problem, events=first_two), runs=2)
+    assert not np.allclose(two["mean"][:, 1], perfect["mean"][:, 1])
+
+
+@ignore_collapse
+@each_case
+def test_observations_mean_the_same_in_every_form(name: str) -> None:
+    """A list of events, an array for each agent, and values or events step by step."""
+    case = CASES[name]
+    runs = 2 if case.runs else 0
+    problem = problem_of(case, runs=runs)
+    # Arrays are of agents with one sensor.
+    single = []
+    for sensors in problem.sensors:
+        single.append(sensors[0] if isinstance(sensors, list) else sensors)
+    events = [e for e in problem.events if e.sensor == 0]
+    problem = replace(problem, sensors=single, events=events)
+    arrays: list[Any] = []
+    for agent in range(len(single)):
+        values = [e.value for e in events if e.agent == agent]
+        arrays.append(np.array(values) if values else None)
+    by_events = record(case, problem, runs=runs)
+    f = build(case, problem)
+    start = f.start(
+        make_prior(case, problem),
+        rng=np.random.default_rng(0),
+        runs=(runs,) if runs else (),
+    )
+    by_arrays = f.run(start, TIMES, arrays)
+    # The same bits: both ways end in the same steps.
+    assert_equal(by_arrays, by_events, atol=0.0)
+    with_values = start
+    with_events = start
+    for k, t in enumerate(TIMES):
+        values = [None if series is None else series[k] for series in arrays]
+        with_values = f.step(with_values, t, values)
+        now = [e for e in events if e.t == t]
+        lists = [[e for e in now if e.agent == agent] for agent in range(len(single))]
+        with_events = f.step(with_events, t, lists)
+    expected = by_events.isel(time=-1)
+    for state in (with_values, with_events):
+        summary = f.summarize(state)
+        assert np.allclose(summary.mean, expected["mean"], rtol=0, atol=1e-12)
+        assert np.allclose(summary.variance, expected["variance"], rtol=0, atol=1e-12)
+        sent = state.ledger.scalars
+        assert np.array_equal(sent, expected["scalars_total"].values)
+
+
+@ignore_collapse
 @each_case
 def test_agents_without_a_network_are_filters_of_one_agent(name: str) -> None:
     case = CASES[name]
@@ -69,7 +133,8 @@ def test_agents_without_a_network_are_filters_of_one_agent(name: str) -> None:
     together = record(case, replace(problem, graph=APART))
     one = Graph.from_edges(1, [])
     for agent in range(4):
-        mine = [replace(e, agent=0) for e in problem.events if e.agent == agent]
+        # The agent's own events and prior, as those of the only agent
+        events = [replace(e, agent=0) for e in problem.events if e.agent == agent]
         place = 0 if case.prior in ("one", "common members") else agent
         single = replace(
             problem,
@@ -77,7 +142,7 @@ def test_agents_without_a_network_are_filters_of_one_agent(name: str) -> None:
             priors=[problem.priors[place]],
             members=problem.members[[place]],
             graph=one,
-            events=mine,
+            events=events,
         )
         # Each agent has its own share of consensus only where there is a network.
         alone = record(case, single)
@@ -86,7 +151,10 @@ def test_agents_without_a_network_are_filters_of_one_agent(name: str) -> None:
 
 @ignore_collapse
 @each_case
-def test_a_list_of_events_in_two_calls_is_the_list_in_one(name: str) -> None:
+def test_a_list_of_events_in_two_calls_is_the_list_in_one(
+    name: str, tmp_path: Path
+) -> None:
+    """Also if the state between them was saved, with its past and what waits for a contact."""
     case = CASES[name]
     problem = problem_of(case)
     f = build(case, problem)
@@ -95,12 +163,15 @@ def test_a_list_of_events_in_two_calls_is_the_list_in_one(name: str) -> None:
     early = [e for e in problem.events if e.t < TIMES[2]]
     late = [e for e in problem.events if e.t >= TIMES[2]]
     *_, between = f.steps(start, TIMES[:2], early)
-    *_, after = f.steps(between, TIMES[2:], late)
+    between.save(tmp_path / "between.npz")
+    loaded = type(between).load(tmp_path / "between.npz")
     a = f.summarize(expected)
-    b = f.summarize(after)
-    assert np.array_equal(a.mean, b.mean)
-    assert np.array_equal(a.variance, b.variance)
-    assert np.array_equal(expected.ledger.scalars, after.ledger.scalars)
+    for state in (between, loaded):
+        *_, after = f.steps(state, TIMES[2:], late)
+        b = f.summarize(after)
+        assert np.array_equal(a.mean, b.mean)
+        assert np.array_equal(a.variance, b.variance)
+        assert np.array_equal(expected.ledger.scalars, after.ledger.scalars)
 
 
 @ignore_collapse

@@ -293,6 +293,10 @@ def test_condition_of_least_squares(
     a = uniform @ np.diag([1.0, 1.0, 1.0, 1e-6]) + 1.0
     s = np.linalg.svd(a, compute_uv=False)
     alpha = tikhonov(s[0], s[-1], condition=condition)
+    # The singular values of the padded matrix are √(s² + α²), of the required ratio.
+    largest = np.hypot(s[0], alpha)
+    smallest = np.hypot(s[-1], alpha)
+    assert np.isclose(largest / smallest, condition, rtol=1e-9)
     padded = np.concatenate([a, alpha * np.eye(4)])
     # min |A w - b|² + α² |w|² is least squares with α I below A.
     exact = a @ [1.0, 2.0, 0.5, 1.0]
@@ -359,7 +363,6 @@ def test_average_keeps_the_conditional_and_averages_the_target() -> None:
     assert np.allclose(mixed.log_density(x) - target, given_t, rtol=1e-9)
     several = random_mixture(3, 4, 42)
     mixed = average_mixtures(several, other)
-    matrix, shift = random_frame(4, target_dim=2)
     # A received component is shared by the prior's in proportion to their densities at
     # its mean.
     logs = several.marginal(TARGET).component_log_densities(other.means)
@@ -368,6 +371,20 @@ def test_average_keeps_the_conditional_and_averages_the_target() -> None:
     shares *= 0.5 * scale[:, None]
     weights = np.concatenate([0.5 * several.weights, shares.ravel()])
     assert np.allclose(mixed.weights, weights)
+    # t ~ N(m_b, P_b) and e = m_e + G (t - m_t) + noise, for each pair of b and a component
+    pairs = zip(mixed.means[3:], mixed.covs[3:], strict=True)
+    for b, k in np.ndindex(3, 3):
+        mean, cov = next(pairs)
+        p = several.covs[k]
+        gain = p[2:, :2] @ np.linalg.inv(p[:2, :2])
+        shift = other.means[b] - several.means[k, :2]
+        assert np.allclose(mean[:2], other.means[b])
+        assert np.allclose(mean[2:], several.means[k, 2:] + gain @ shift)
+        residual_cov = p[2:, 2:] - gain @ p[:2, 2:]
+        ego_cov = residual_cov + gain @ other.covs[b] @ gain.T
+        assert np.allclose(cov[2:, 2:], ego_cov)
+        assert np.allclose(cov[2:, :2], gain @ other.covs[b])
+    matrix, shift = random_frame(4, target_dim=2)
     received = transform(other, matrix[:2, :2], shift[:2])
     transformed = average_mixtures(transform(several, matrix, shift), received)
     assert_same(transformed, transform(mixed, matrix, shift), 1e-7)

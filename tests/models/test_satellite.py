@@ -48,7 +48,7 @@ def test_noise_of_two_half_steps_is_that_of_a_whole_step() -> None:
     phi = model.F(0.05)
     q = model.Q(0.0, 0.05)
     two_steps = phi @ q @ phi.T + q
-    assert np.allclose(two_steps, model.Q(0.0, 0.1), rtol=1e-12)
+    assert np.allclose(two_steps, model.Q(0.0, 0.1), rtol=1e-12, atol=1e-16)
     # In a short step it is σ² dt.
     short = 1e-7
     expected = 0.2**2 * short * np.eye(6)

@@ -43,7 +43,7 @@ def permuted(graph: Graph, order: list[int]) -> Graph:
     return Graph.from_adjacency(links, directed=True)
 
 
-def heard_by(agent: int, arrived: Array) -> list[int]:
+def sources_of(agent: int, arrived: Array) -> list[int]:
     """Return the agent itself and the senders whose message arrived."""
     return [agent, *np.flatnonzero(arrived[agent]).tolist()]
 
@@ -65,6 +65,7 @@ def intersect(means: Array, covs: Array, rule: str) -> tuple[Array, Array]:
     if rule.startswith("min"):
         weights = intersection_weights(covs, rule=rule)
         return intersect_gaussians(means, covs, weights)
+    # Weights are proportional to these.
     sizes = {
         "equal": np.ones(n),
         "trace": 1 / np.trace(covs, axis1=1, axis2=2),
@@ -78,6 +79,7 @@ def add(means: Array, covs: Array) -> tuple[Array, Array]:
 
 
 def average(means: Array, covs: Array) -> tuple[Array, Array]:
+    # The moments of a mixture with equal weights
     mean = means.mean(axis=0)
     return mean, covs.mean(axis=0) + np.cov(means.T, bias=True)
 
@@ -103,11 +105,14 @@ def test_each_agent_fuses_what_arrives_in_its_run(name: str) -> None:
     new_means, new_covs = rule((means, covs), channel, rounds=2)
     for round_ in range(2):
         arrived = arrivals(FAULTS, DIGRAPH, round_, runs=2)
-        before = means.copy(), covs.copy()
+        # All agents send what they had before the round.
+        old_means = means.copy()
+        old_covs = covs.copy()
         for run, agent in np.ndindex(2, 4):
-            heard = heard_by(agent, arrived[run])
-            fused = plain(before[0][run, heard], before[1][run, heard])
+            sources = sources_of(agent, arrived[run])
+            fused = plain(old_means[run, sources], old_covs[run, sources])
             means[run, agent], covs[run, agent] = fused
+    # In units of the standard deviations
     scale = np.sqrt(np.diagonal(covs, axis1=-2, axis2=-1))
     assert np.allclose(new_means / scale, means / scale, atol=1e-5)
     relative = scale[..., :, None] * scale[..., None, :]
@@ -127,11 +132,12 @@ def test_a_pull_by_what_arrives(include_self: bool) -> None:
     )
     arrived = arrivals(FAULTS, DIGRAPH, runs=2)
     for run, agent in np.ndindex(2, 4):
-        own = x[run, agent].mean(axis=0)
+        own_mean = x[run, agent].mean(axis=0)
         others = x[run, np.flatnonzero(arrived[run, agent])].mean(axis=1)
-        mean = own + gain * (others - own).sum(axis=0)
+        # m + γ Σ_j (m_j - m), and deviations times 1 - γ times the number of terms
+        mean = own_mean + gain * (others - own_mean).sum(axis=0)
         factor = 1 - gain * (len(others) + include_self)
-        expected = mean + factor * (x[run, agent] - own)
+        expected = mean + factor * (x[run, agent] - own_mean)
         assert np.allclose(new[run, agent], expected, atol=1e-12)
 
 
@@ -157,6 +163,7 @@ def test_angles_far_from_the_cut_are_numbers_also_with_losses(rule: Any) -> None
     means, covs = gaussians(3, *RUNS, 5, d=3)
     means *= 0.1
     period = 2.0
+    # All means lie within a tenth of the period, so that plain numbers are right.
     plain = rule((means, covs), channel_of(RING))
     turned = means.copy()
     turned[..., 1] += period * np.array([0, 1, 0, -2, 3])
@@ -184,6 +191,7 @@ def test_diffusion_puts_the_weight_of_a_lost_mean_where_it_is_told(
     new, _ = network.diffuse_means((means, covs), channel, on_loss=on_loss)
     arrived = arrivals(FAULTS, GRID, runs=2)
     if on_loss in ("mutual", "metropolis"):
+        # A lost message cancels its answer.
         arrived &= arrived.mT
     full = weighting.metropolis(GRID).matrix.toarray()
     weights = np.where(arrived, full, 0.0)
@@ -191,12 +199,13 @@ def test_diffusion_puts_the_weight_of_a_lost_mean_where_it_is_told(
         degree = arrived.sum(axis=-1)
         larger = np.maximum(degree[..., :, None], degree[..., None, :])
         weights = arrived / (1 + larger)
-    own = 1 - weights.sum(axis=-1)
+    # The agent's own mean has the rest, or its usual share of what has come.
+    self_weights = 1 - weights.sum(axis=-1)
     if on_loss == "renormalise":
         total = full.diagonal() + weights.sum(axis=-1)
         weights = weights / total[..., None]
-        own = full.diagonal() / total
-    expected = weights @ means + own[..., None] * means
+        self_weights = full.diagonal() / total
+    expected = weights @ means + self_weights[..., None] * means
     assert np.allclose(new, expected, atol=1e-12)
 
 
@@ -209,9 +218,10 @@ def test_a_scale_is_that_of_divided_components(rule: Any, has_constant: bool) ->
         x[..., 2] = 4.0
     scale = np.array([10.0, 0.3, 2.0])
     fuse = partial(network.intersect_ensembles, rule=rule)
-    whole = fuse(x, circular(RING, (None, 0.9, None)), scale=scale)
+    # The period of 0.9 is one of 3 in units of 0.3.
+    scaled = fuse(x, circular(RING, (None, 0.9, None)), scale=scale)
     divided = fuse(x / scale, circular(RING, (None, 3.0, None)))
-    assert np.allclose(whole, divided * scale, atol=1e-9)
+    assert np.allclose(scaled, divided * scale, atol=1e-9)
 
 
 def test_rounds_of_split_intersection_know_of_the_first() -> None:
@@ -222,6 +232,7 @@ def test_rounds_of_split_intersection_know_of_the_first() -> None:
     two = fuse((means, dependent, independent), channel_of(RING), rounds=2)
     channel = channel_of(RING)
     m, first, second = fuse((means, dependent, independent), channel)
+    # The second round is on the same channel, whose losses go on.
     expected = fuse((m, first + second, 0 * second), channel)
     for new, old in zip(two, expected, strict=True):
         assert np.allclose(new, old, rtol=1e-9)
@@ -274,9 +285,9 @@ def test_a_run_of_a_batch_is_the_run_alone_with_its_losses(name: str) -> None:
     together = rule(values, batch)
     lost = []
     for run in range(2):
-        alone = channel_of(graph).for_run(np.array(run), Ledger.empty(n))
-        assert np.allclose(together[run], rule(values[run], alone), atol=1e-12)
-        lost.append(alone.ledger.lost)
+        of_run = channel_of(graph).for_run(np.array(run), Ledger.empty(n))
+        assert np.allclose(together[run], rule(values[run], of_run), atol=1e-12)
+        lost.append(of_run.ledger.lost)
     assert np.allclose(batch.ledger.lost, np.mean(lost, axis=0))
     assert not np.array_equal(*lost)
 
@@ -311,8 +322,9 @@ def test_weights_of_a_digraph_keep_averages_and_agreement() -> None:
     matrix = weighting.doubly_stochastic(DIGRAPH).matrix.toarray()
     assert np.allclose(matrix.sum(axis=0), 1.0)
     assert np.allclose(matrix.sum(axis=1), 1.0)
-    off = matrix - np.diag(matrix.diagonal())
-    assert np.array_equal(off != 0, DIGRAPH.links.toarray() != 0)
+    # Weights are on the links alone.
+    off_diagonal = matrix - np.diag(matrix.diagonal())
+    assert np.array_equal(off_diagonal != 0, DIGRAPH.links.toarray() != 0)
     # The agent that moves most keeps half of its value.
     assert np.isclose(matrix.diagonal().min(), 0.5)
 
@@ -322,12 +334,14 @@ def test_expected_gossip_is_the_mean_of_its_rounds() -> None:
     n = TREE.n_agents
     expected = np.zeros((n, n))
     for i in range(n):
-        near = TREE.neighbours(i)
-        for j in near:
+        neighbours = TREE.neighbours(i)
+        for j in neighbours:
+            # I - ½ (e_i - e_j)(e_i - e_j)ᵀ replaces both values by their mean.
             difference = np.eye(n)[i] - np.eye(n)[j]
             mixing = np.eye(n) - 0.5 * np.outer(difference, difference)
-            expected += mixing / (n * len(near))
-    assert np.allclose(weighting.expected_gossip(TREE).matrix.toarray(), expected)
+            expected += mixing / (n * len(neighbours))
+    matrix = weighting.expected_gossip(TREE).matrix.toarray()
+    assert np.allclose(matrix, expected)
 
 
 def test_the_stable_gain_of_a_digraph_is_where_agreement_ends() -> None:
@@ -338,17 +352,19 @@ def test_the_stable_gain_of_a_digraph_is_where_agreement_ends() -> None:
     for gain, agrees in ((0.999, True), (1.001, False)):
         mixing = np.eye(5) - gain * graph.max_stable_gain * laplacian
         sizes = np.sort(np.abs(np.linalg.eigvals(mixing)))
-        # The eigenvalue of agreement is 1.
-        assert (sizes[-2] < 1 and np.isclose(sizes[-1], 1)) == agrees
+        # The eigenvalue of agreement is 1, and all others have to be smaller.
+        is_stable = sizes[-2] < 1 and np.isclose(sizes[-1], 1)
+        assert is_stable == agrees
     assert np.isclose(DIGRAPH.degree_bound_gain, 1 / 3)
     assert np.array_equal(graph.hops(0), [0, 2, 1, 2, 3])
 
 
 def test_losses_belong_to_a_receiver_or_to_a_link() -> None:
     by_receiver = arrivals(Faults(loss=[0.0, 1.0, 0.0, 0.0]), DIGRAPH)[0]
-    assert np.flatnonzero(
-        ~by_receiver[DIGRAPH.receivers, DIGRAPH.senders]
-    ).tolist() == [k for k, receiver in enumerate(DIGRAPH.receivers) if receiver == 1]
+    is_lost = ~by_receiver[DIGRAPH.receivers, DIGRAPH.senders]
+    # All links to agent 1, and no others
+    assert np.array_equal(is_lost, DIGRAPH.receivers == 1)
+    # A matrix has the receiver first: from agent 2 to agent 3
     matrix = np.zeros((4, 4))
     matrix[3, 2] = 1.0
     by_link = arrivals(Faults(loss=matrix), DIGRAPH)[0]
@@ -371,16 +387,17 @@ def test_bursts_are_as_long_as_they_are_told() -> None:
     pair = Graph.from_edges(2, [(0, 1)], directed=True)
     faults = Faults(loss=0.4, burst_length=5.0, seed=3)
     lost = faults.draw_rounds(pair, range(20_000), 4)[:, :, 0]
+    # A burst begins where a loss follows a message that arrived.
     begins = np.diff(lost.astype(int), axis=0) == 1
     assert abs(lost.sum() / begins.sum() - 5.0) < 0.2
     assert abs(lost.mean() - 0.4) < 0.02
 
 
 def test_delays_add_up_and_windows_silence_nobody_for_good() -> None:
-    both = Faults(delay=2) | Faults(delay=3) | Faults(silent=[1], during=[(2, 4)])
-    assert both.total_delay == 5
-    assert both.always_silent == frozenset()
-    assert (both | Faults(silent=[2])).always_silent == {2}
+    faults = Faults(delay=2) | Faults(delay=3) | Faults(silent=[1], during=[(2, 4)])
+    assert faults.total_delay == 5
+    assert faults.always_silent == frozenset()
+    assert (faults | Faults(silent=[2])).always_silent == {2}
 
 
 def test_a_reply_is_in_both_bills() -> None:
@@ -388,7 +405,8 @@ def test_a_reply_is_in_both_bills() -> None:
     values = np.zeros((DIGRAPH.senders.size, 2))
     channel.send_on_links(values, acknowledged=True, is_broadcast=True)
     ledger = channel.ledger
-    out_degree, in_degree = DIGRAPH.out_degree, DIGRAPH.in_degree
+    out_degree = DIGRAPH.out_degree
+    in_degree = DIGRAPH.in_degree
     # A reply has a byte and no scalar.
     assert np.array_equal(ledger.messages, out_degree + in_degree)
     assert np.array_equal(ledger.scalars, 2 * out_degree)
@@ -434,17 +452,18 @@ def test_fusion_on_a_tree_creates_no_information() -> None:
     common_means = np.zeros((*RUNS, n_links, 3))
     common_means[...] = [0.3, -0.2, 0.5]
     channel = channel_of(TREE)
-    belief, link = (means, covs), (common_means, common)
+    belief = (means, covs)
+    link = (common_means, common)
 
     def totals(belief: Any, link: Any) -> list[Array]:
         result = []
         for vector in (False, True):
             parts = []
             for m, p in (belief, link):
+                # Y = P⁻¹ and y = P⁻¹ m
                 precision = np.linalg.inv(p)
-                parts.append(
-                    (precision @ m[..., None])[..., 0] if vector else precision
-                )
+                information_vector = (precision @ m[..., None])[..., 0]
+                parts.append(information_vector if vector else precision)
             # Each undirected link has two entries.
             result.append(parts[0].sum(axis=1) - 0.5 * parts[1].sum(axis=1))
         return result
@@ -471,12 +490,14 @@ def joint_matrix(diagonal: Array, couplings: Array) -> Array:
 
 def test_beliefs_on_a_tree_are_marginals_of_couplings_that_are_not_symmetric() -> None:
     d = 2
+    # J_ji = J_ijᵀ
     couplings = 0.4 * rng(3).standard_normal((TREE.senders.size, d, d))
     first = TREE.receivers < TREE.senders
     couplings[TREE.reverse[first]] = couplings[first].mT
     diagonal = gaussians(4, 5, d=d)[1] + 3 * np.eye(d)
     vectors = rng(5).standard_normal((5, d))
     joint = joint_matrix(diagonal, couplings)
+    # The joint Gaussian has the covariance J⁻¹ and the mean J⁻¹ h.
     cov = np.linalg.inv(joint)
     expected = (cov @ vectors.ravel()).reshape(5, d)
     solve = network.gaussian_belief_propagation
@@ -489,6 +510,7 @@ def test_beliefs_on_a_tree_are_marginals_of_couplings_that_are_not_symmetric() -
     means, covs = solve(diagonal, vectors, couplings, late, rounds=60)
     assert np.allclose(means, expected, atol=1e-12)
     assert np.allclose(covs, blocks, atol=1e-12)
+    # From round 6 on nothing arrives: six rounds are more than the tree's diameter.
     silent = Channel(TREE, faults=Faults(loss=1.0, during=[(6, 99)]))
     means, _ = solve(diagonal, vectors, couplings, silent, rounds=9)
     assert np.allclose(means, expected, atol=1e-12)
@@ -499,7 +521,11 @@ def test_substeps_of_the_estimator_by_hand() -> None:
     draw = rng(6)
     nu, eta, u, rate = draw.standard_normal((4, *RUNS, 5, 2))
     laplacian = RING.laplacian.toarray()
-    alpha, a, b, dt, n = 0.7, 0.4, 0.2, 0.6, 3
+    alpha = 0.7
+    a = 0.4
+    b = 0.2
+    dt = 0.6
+    n = 3
     state = network.PIState(nu, eta)
     new = network.pi_step(
         state, u, channel_of(RING, lossy=False), dt=dt, alpha=alpha, a=a, b=b,
@@ -527,6 +553,7 @@ def test_the_residuals_of_admm_are_in_the_units_of_the_penalty() -> None:
 
     start = np.ones((5, 2))
     local = solve(start, rho)
+    # |u - z| after the average z, and ρ |z - z before|
     mean = local.mean(axis=0)
     dual = rho * np.abs(mean - start).max()
     primal = np.abs(local - mean).max()
@@ -546,9 +573,11 @@ def test_a_flood_sends_back_nothing_where_it_is_told(
     n = graph.n_agents
     channel = Channel(graph)
     values = rng(1).standard_normal((n, 2))
-    average_, known = network.flooding(values, channel, split_horizon=split_horizon)
-    assert known.all()
-    assert np.allclose(average_, values.mean(axis=0))
+    averages, is_complete = network.flooding(
+        values, channel, split_horizon=split_horizon
+    )
+    assert is_complete.all()
+    assert np.allclose(averages, values.mean(axis=0))
     links = list(zip(graph.receivers.tolist(), graph.senders.tolist(), strict=True))
     knows = [{i} for i in range(n)]
     new = [{i} for i in range(n)]
@@ -561,6 +590,7 @@ def test_a_flood_sends_back_nothing_where_it_is_told(
             sent[receiver, sender] = new[sender] - back
         new = [set() for _ in range(n)]
         for (receiver, sender), values_sent in sent.items():
+            # Two numbers of each value, and whose it is
             scalars[sender] += 3 * len(values_sent)
             came[receiver, sender] |= values_sent
             new[receiver] |= values_sent - knows[receiver]

@@ -181,6 +181,46 @@ def test_push_sum_reaches_the_average_through_heavy_loss(
     assert (channel.ledger.scalars == 2 * 900 * graph.out_degree).all()
 
 
+@pytest.mark.parametrize(
+    ("rounds", "vanished"),
+    [
+        (60, []),
+        (300, [0, 2, 3, 4]),
+        (700, [0, 1, 2, 3, 4]),
+        (1500, [0, 1, 2, 3, 4]),
+    ],
+)
+def test_push_sum_names_agents_whose_weights_vanish(
+    rounds: int, vanished: list[int]
+) -> None:
+    values = np.array([[0.0], [3.0], [6.0], [9.0], [12.0]])
+    channel = Channel(graphs.ring(5), faults=Faults(silent=[1]))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        ratios = network.push_sum(values, channel, rounds=rounds).ravel()
+    # The silent agent keeps its value. The others agree on a weighted mean of theirs, which has
+    # converged after 60 rounds, long before rounding reaches it.
+    assert abs(ratios[1] - 3.0) < 1e-12
+    assert np.abs(ratios[[0, 2, 3, 4]] - 7.635255).max() < 1e-5
+    messages = [str(warning.message) for warning in caught]
+    assert {warning.category for warning in caught} == {Disconnected}
+    assert "agents [1] silent" in messages[0]
+    if vanished:
+        assert f"weights of agents {vanished} that vanish in rounding" in messages[1]
+    assert len(messages) == 1 + bool(vanished)
+
+
+def test_push_sum_recovers_after_a_long_silence() -> None:
+    values = np.array([[0.0], [3.0], [6.0], [9.0], [12.0]])
+    faults = Faults(silent=[1], during=[(5, 800)])
+    with warnings.catch_warnings(action="error"):
+        ratios = network.push_sum(
+            values, Channel(graphs.ring(5), faults=faults), rounds=1000
+        )
+    # The running sums that arrive after the silence bring everything that was pushed in vain.
+    assert np.abs(ratios - 6.0).max() < 1e-9
+
+
 def test_averages_on_a_digraph() -> None:
     edges = [(1, 0), (2, 1), (3, 2), (0, 3), (2, 0)]
     graph = Graph.from_edges(4, edges, directed=True)

@@ -77,10 +77,10 @@ def make_team(delay: float, functions: list[Any]) -> list[InputModel]:
 
 # Robots of one function whose inputs have the same times are moved at once.
 LOG_KINDS = {
-    "own times": ROBOTS,
+    "different times": ROBOTS,
     "same times": make_team(0.0, [drive] * 3),
     "times of equal number": make_team(0.1, [drive] * 3),
-    "own functions": make_team(0.0, [drive, drive_slowly, drive]),
+    "different functions": make_team(0.0, [drive, drive_slowly, drive]),
 }
 PRIORS = [
     (np.array([0.0, 0.0, 0.7]), np.diag([0.1, 0.1, 0.05])),
@@ -105,21 +105,28 @@ def plain_ekf(agent: int) -> tuple[np.ndarray, np.ndarray]:
     log = LOGS[agent]
     now = 0.0
     for k, t in enumerate(TIMES):
+        # The step is cut where an input begins.
         edges = [now, *[s for s in log.times.tolist() if now < s < t], t]
         for a, b in zip(edges[:-1], edges[1:], strict=True):
             u = log.values[np.flatnonzero(log.times <= a)[-1]]
-            dt, c, s = b - a, np.cos(m[2]), np.sin(m[2])
+            dt = b - a
+            c = np.cos(m[2])
+            s = np.sin(m[2])
+            # F = ∂x'/∂x and G = ∂x'/∂u of x' = x + dt (v cos θ, v sin θ, ω) with u = (v, ω)
             f = np.array([[1, 0, -dt * u[0] * s], [0, 1, dt * u[0] * c], [0, 0, 1]])
             g = np.array([[dt * c, 0], [dt * s, 0], [0, dt]])
             p = f @ p @ f.T + g @ log.cov @ g.T
             m = drive(m, u, dt)
         now = t
         if agent == 0:
-            away = m[:2] - [9.0, 9.0]
-            r = np.linalg.norm(away)
-            h = np.array([[away[0] / r, away[1] / r, 0.0]])
-            innovation, noise = np.array(SEEN[0][k]) - r, np.array([[0.01]])
+            # The derivative of a distance is the unit vector.
+            offset = m[:2] - [9.0, 9.0]
+            r = np.linalg.norm(offset)
+            h = np.array([[offset[0] / r, offset[1] / r, 0.0]])
+            innovation = np.array(SEEN[0][k]) - r
+            noise = np.array([[0.01]])
         elif agent == 1:
+            # Components that are there
             rows = np.flatnonzero(~np.isnan(SEEN[1][k]))
             h = np.eye(3)[rows]
             innovation = np.array(SEEN[1][k])[rows] - h @ m
@@ -127,7 +134,8 @@ def plain_ekf(agent: int) -> tuple[np.ndarray, np.ndarray]:
         else:
             continue
         gain = np.linalg.solve(h @ p @ h.T + noise, h @ p).T
-        m, p = m + gain @ innovation, p - gain @ h @ p
+        m = m + gain @ innovation
+        p = p - gain @ h @ p
     return m, p
 
 
@@ -139,6 +147,7 @@ def test_every_robot_is_an_extended_filter_with_its_own_odometry() -> None:
         mean, cov = plain_ekf(agent)
         error = run["mean"].values[-1, agent] - mean
         assert np.abs(error[:2]).max() < 1e-8
+        # The heading, up to whole turns
         assert abs(np.angle(np.exp(1j * error[2]))) < 1e-8
         assert np.allclose(run["covariance"].values[-1, agent], cov, atol=1e-8)
 
@@ -169,15 +178,15 @@ def test_a_team_is_its_robots_one_by_one_for_each_run(option: str, logs: str) ->
     start = team.start(PRIORS, runs=(2,))
     run = team.run(start, TIMES, [*seen, None], delayed=delayed)
     for agent in range(3):
-        alone = filters.GaussianFilter(robots[agent], [SENSORS[agent]], **options)
-        own = [seen[agent]] if agent < 2 else [None]
-        late_own = [o.replace(agent=0) for o in delayed if o.agent == agent]
-        expected = alone.run(
-            alone.start(PRIORS[agent], runs=(2,)), TIMES, own, delayed=late_own
-        )
+        # A filter of this robot only, with its observations
+        single = filters.GaussianFilter(robots[agent], [SENSORS[agent]], **options)
+        observed = [seen[agent]] if agent < 2 else [None]
+        late = [o.replace(agent=0) for o in delayed if o.agent == agent]
+        start = single.start(PRIORS[agent], runs=(2,))
+        expected = single.run(start, TIMES, observed, delayed=late)
         for name in ("mean", "covariance"):
-            found = run[name].isel(agent=agent).values
-            assert np.allclose(found, expected[name].values[:, :, 0], atol=1e-10)
+            values = run[name].isel(agent=agent).values
+            assert np.allclose(values, expected[name].values[:, :, 0], atol=1e-10)
 
 
 @pytest.mark.parametrize("runs", [(), (2,)])
@@ -203,6 +212,7 @@ def test_members_move_with_draws_of_their_own_robots_inputs(
     for agent, robot in enumerate(plain):
         x = members[..., agent, :, :]
         for _, dt, u in LOGS[agent].pieces(0.0, 1.5):
+            # u + L z with Σ = L Lᵀ, for each piece of the step
             root = np.linalg.cholesky(LOGS[agent].cov)
             draws = child.standard_normal((*x.shape[:-1], 2)) @ root.T
             x = drive(x, u + draws, dt)
@@ -235,10 +245,11 @@ def test_members_of_a_team_have_the_moments_of_its_robots_alone(family: str) -> 
     late = Observation(1.1, 1, (paths[1][0] + paths[1][1])[:2] / 2, arrival_time=3.0)
     run = team.run(start, TIMES, seen, delayed=[late])
     for agent in range(3):
-        alone = make(ROBOTS[agent], [sensors[agent]], lag=2)
+        # Other draws, so that both differ by the errors of 8000 members.
+        single = make(ROBOTS[agent], [sensors[agent]], lag=2)
         delayed = [late.replace(agent=0)] if agent == 1 else []
-        start = alone.start(PRIORS[agent], rng=np.random.default_rng(9))
-        expected = alone.run(start, TIMES, [seen[agent]], delayed=delayed)
+        start = single.start(PRIORS[agent], rng=np.random.default_rng(9))
+        expected = single.run(start, TIMES, [seen[agent]], delayed=delayed)
         std = np.sqrt(expected["variance"].values[-1, 0])
         error = run["mean"].values[-1, :, agent] - expected["mean"].values[-1, 0]
         assert np.abs(error / std).max() < 0.1
@@ -288,12 +299,12 @@ def test_simulations_and_derivatives_are_those_of_each(logs: str) -> None:
     batch = np.random.default_rng(1).standard_normal((2, 3, 4, 3))
     behind_runs = team.at_axis(1)
     for _ in range(2):
-        found = behind_runs.step(batch, 0.0, 1.5)
+        moved = behind_runs.step(batch, 0.0, 1.5)
         noise = behind_runs.noise_at(batch, 0.0, 1.5)
         for agent, robot in enumerate(robots):
-            own = batch[:, agent]
-            assert np.array_equal(found[:, agent], robot.step(own, 0.0, 1.5))
-            expected = robot.noise_at(own, 0.0, 1.5)
+            members = batch[:, agent]
+            assert np.array_equal(moved[:, agent], robot.step(members, 0.0, 1.5))
+            expected = robot.noise_at(members, 0.0, 1.5)
             assert np.allclose(noise[:, agent], expected, atol=1e-9)
 
 
@@ -316,8 +327,8 @@ def test_each_model_is_told_its_own_deviations(axis: int) -> None:
     if axis:
         std = np.array([[[1.0], [5.0]], [[2.0], [6.0]]])
     team = AgentModels.from_models(echoes).at_axis(axis)
-    found = team.jacobian(np.zeros_like(std), 0.0, 1.0, std=std)
-    assert np.array_equal(found[..., 0], std)
+    slopes = team.jacobian(np.zeros_like(std), 0.0, 1.0, std=std)
+    assert np.array_equal(slopes[..., 0], std)
 
 
 def test_a_robot_that_wraps_undeclared_is_named_once() -> None:

@@ -138,6 +138,7 @@ def test_an_observation_beyond_the_cut(family: str, kind: str) -> None:
     f = FAMILIES[family](still(periods=periods), [sensor], gate_probability=0.999)
     state = quietly(f.step, start(f, [3.1], [[0.01]]), 0.0, [[-3.1]])
     summary = f.summarize(state)
+    # Equal variances of 0.01 give the mean of both angles, and 1 / (1/0.01 + 1/0.01) = 0.005.
     assert abs(wrap(summary.mean[0, 0] - np.pi)) < tolerance(family)
     assert abs(summary.variance[0, 0] - 0.005) < max(tolerance(family) / 20, 1e-6)
     # cra-ros-pkg/robot_localization 237: the gate takes the shorter way.
@@ -166,13 +167,13 @@ def test_a_vague_heading(family: str, kind: str, std: float) -> None:
     f = FAMILIES[family](model, [sensor])
     state = start(f, np.zeros(3), np.diag([1.0, 1.0, std**2]))
     summary = f.summarize(quietly(f.step, state, 0.0, [[1.5]]))
-    # The scalar Kalman filter on the line.
+    # The scalar Kalman filter on the line: m = K y and P = K R with K = P₀ / (P₀ + R)
     gain = std**2 / (std**2 + 0.01)
+    expected_std = np.sqrt(gain * 0.01)
     allowed = 1e-6 if family in GAUSSIAN else 0.05
     assert abs(summary.mean[0, 2] - gain * 1.5) < allowed
-    assert abs(summary.variance[0, 2] ** 0.5 - np.sqrt(gain * 0.01)) < max(
-        allowed / 2, 1e-6
-    )
+    std_error = abs(np.sqrt(summary.variance[0, 2]) - expected_std)
+    assert std_error < max(allowed / 2, 1e-6)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -184,6 +185,7 @@ def test_points_that_straddle_the_cut_of_a_bearing(family: str) -> None:
         f = FAMILIES[family](
             still(2, periods=()), [bearing([0, 1], std=0.05)], gate_probability=0.999
         )
+        # The observation is 0.02 beyond the negative x axis, the state 0.05 / 3 before it.
         state = start(f, rotation @ [-3.0, 0.05], 0.01 * np.eye(2))
         angle = np.pi + 0.02 + np.arctan2(rotation[1, 0], rotation[0, 0])
         state = quietly(f.step, state, 0.0, [wrap([angle])])
@@ -198,19 +200,21 @@ def test_a_period_of_360(family: str) -> None:
     sensor = component([0], std=2.0, periods=(360.0,))
     f = FAMILIES[family](still(periods=(360.0,)), [sensor])
     state = quietly(f.step, start(f, [359.0], [[4.0]]), 0.0, [[1.0]])
+    # In degrees all numbers are some thirty times larger than in the other tests.
     assert abs(f.summarize(state).mean[0, 0]) < 30 * tolerance(family)
 
 
 def test_sensors_of_angles_keep_their_periods_in_a_stack() -> None:
     """The residual wraps in its own parts only, whatever the lengths of the parts are."""
-    both = stack(
+    sensor = stack(
         [
             bearing([0, 1], std=0.1),
             component([0, 1], std=0.1),
             increment([1], std=0.1, periods=(TURN,)),
         ]
     )
-    residual = both.residual([3.0, 9.0, 9.0, 6.0], [-3.0, 0.0, 0.0, 0.0])
+    residual = sensor.residual([3.0, 9.0, 9.0, 6.0], [-3.0, 0.0, 0.0, 0.0])
+    # The first and the last number are angles, and the two between them lengths.
     assert np.allclose(residual, [6 - TURN, 9.0, 9.0, 6.0 - TURN])
 
 
@@ -228,7 +232,9 @@ def test_an_increment_over_the_cut(family: str) -> None:
     for value in (0.2, 0.2 - TURN):
         f = FAMILIES[family](model, [increment([0], std=0.01, periods=(TURN,))])
         state = quietly(f.step, start(f, [3.1], [[0.09]]), 1.0, [[value]])
-        assert abs(wrap(f.summarize(state).mean[0, 0] - 3.3)) < 0.06
+        # The process noise of 0.2 is all explained by the increment; the start is not observed.
+        mean = f.summarize(state).mean[0, 0]
+        assert abs(wrap(mean - 3.3)) < 0.06
 
 
 # The transition -------------------------------------------------------------------------
@@ -254,7 +260,8 @@ def test_a_transition_that_wraps_is_one_that_runs_on(family: str, cut: bool) -> 
         quietly(f.run, state, times, [truth + noise], truth=wrap(truth)),
     ]
     # The Kalman filter, on the line.
-    mean, p = 2.9, 0.04
+    mean = 2.9
+    p = 0.04
     for k, y in enumerate((truth + noise)[:, 0]):
         p += 1e-3
         gain = p / (p + 0.01)
@@ -263,8 +270,10 @@ def test_a_transition_that_wraps_is_one_that_runs_on(family: str, cut: bool) -> 
         estimate = runs[0]["mean"].values[k, 0, 0]
         assert -np.pi <= estimate < np.pi
         assert abs(wrap(estimate - mean)) < max(tolerance(family), 1e-6) * 1.5
+    # Whether the truth or the observations wrap, the scores are those of the shorter way.
     for name in ("squared_error", "nees", "crps"):
-        first, second = (run[name].values for run in runs)
+        first = runs[0][name].values
+        second = runs[1][name].values
         assert np.allclose(first, second, atol=1e-9)
     assert runs[0]["squared_error"].values.max() < 0.1
     assert runs[0]["crps"].values.max() < 0.3
@@ -275,6 +284,7 @@ def test_smoothing_and_delayed_observations_over_the_cut(family: str) -> None:
     """rlabbe/filterpy 197: as the same turn far from the cut."""
     times = np.arange(1.0, 9.0)
     results = []
+    # From 2.9 the turn crosses the cut at 3.14, from 0.9 it does not.
     for offset in (0.0, 2.0):
         truth = 2.9 - offset + 0.1 * times[:, None]
         model = Model(
@@ -302,7 +312,8 @@ def test_a_position_and_a_heading_that_wraps(family: str) -> None:
     """A robot drives along the negative x axis, its heading at the cut: no mean of ±π is 0."""
 
     def drive(x: np.ndarray, t: float, dt: float) -> np.ndarray:
-        p, heading = x[..., :2], x[..., 2:]
+        p = x[..., :2]
+        heading = x[..., 2:]
         step = np.concatenate([np.cos(heading), np.sin(heading)], axis=-1)
         return np.concatenate([p + dt * step, wrap(heading + 0.01 * dt)], axis=-1)
 
@@ -340,6 +351,7 @@ def test_a_derivative_by_differences_is_the_shorter_way_round() -> None:
         periods=(TURN,),
     )
     slope = model.jacobian([np.pi], 0.0, 1.0)
+    # A difference of nearly 2 π over a small step would give a huge slope.
     assert np.allclose(slope, [[1.0]])
 
 
@@ -356,6 +368,7 @@ def test_a_wide_prior_is_moved_on_the_line(family: str) -> None:
     state = start(f, [0.0], [[9.0]])
     before = f.summarize(state)
     after = f.summarize(f.step(state, 1.0, [None]))
+    # A turn by 1 rad moves the mean and keeps the variance of 9, of which a circle has at most π².
     assert np.allclose(wrap(after.mean - before.mean - 1.0), 0.0, atol=1e-2)
     assert np.allclose(after.variance, before.variance, rtol=1e-2)
 
@@ -395,6 +408,7 @@ def test_jitter_about_the_cut() -> None:
     state = start(f, [np.pi], [[0.04]])
     for t in (0.0, 1.0, 2.0):
         state = quietly(f.step, state, t, [[-np.pi]])
+    # 1 / (1/0.04 + 3/0.01) = 0.055², widened by the kernel; a spread across the cut is about 3.
     summary = f.summarize(state)
     assert abs(wrap(summary.mean[0, 0] - np.pi)) < 0.05
     assert summary.variance[0, 0] ** 0.5 < 0.12
@@ -411,7 +425,7 @@ RULES: dict[str, tuple[str, Callable[..., Any]]] = {
     "naive": ("extended", network.naive_fusion),
     "average": ("extended", network.arithmetic_average),
     "pull": ("extended", partial(network.consensus_pull, gain=0.3)),
-    "own": ("extended", lambda belief, channel: (belief[0][::-1], belief[1])),
+    "user's": ("extended", lambda belief, channel: (belief[0][::-1], belief[1])),
     "ensembles": ("exact", network.intersect_ensembles),
     "ensembles, scaled": ("exact", partial(network.intersect_ensembles, scale=[10.0])),
     "mean pull": ("ensemble", partial(network.mean_pull, gain=0.3)),
@@ -434,9 +448,10 @@ def test_fusion_of_headings_on_both_sides(rule: str) -> None:
         summary = f.summarize(quietly(f.step, state, 0.0, seen))
         assert np.all(np.abs(summary.mean) <= np.pi)
         results.append((wrap(summary.mean - centre), summary.variance))
-    (near, variance), (far, other) = results
-    assert np.allclose(near, far, atol=1e-9)
-    assert np.allclose(variance, other, atol=1e-9)
+    # Relative to their centre the beliefs about π are those about 0.5.
+    (mean_at_cut, variance_at_cut), (mean, variance) = results
+    assert np.allclose(mean_at_cut, mean, atol=1e-9)
+    assert np.allclose(variance_at_cut, variance, atol=1e-9)
 
 
 def test_neighbours_are_brought_next_to_each_receiver() -> None:
@@ -445,8 +460,10 @@ def test_neighbours_are_brought_next_to_each_receiver() -> None:
     channel = Channel(graphs.complete(3))
     channel.periods = (TURN,)
     pulled, _ = network.consensus_pull((means, np.ones((3, 1, 1))), channel, gain=0.1)
+    # m_i + γ Σ_j wrap(m_j - m_i)
     differences = wrap(means[:, 0] - means)
-    assert np.allclose(pulled[:, 0], means[:, 0] + 0.1 * differences.sum(axis=1))
+    expected = means[:, 0] + 0.1 * differences.sum(axis=1)
+    assert np.allclose(pulled[:, 0], expected)
 
 
 PAIRWISE = {
@@ -480,7 +497,9 @@ def test_ensembles_and_mixtures_take_the_shorter_way() -> None:
         partial(network.intersect_ensembles, scale=[3.0]),
         partial(network.mean_pull, gain=0.5, include_self=False),
     ):
-        assert np.allclose(wrap(rule(members, channel).mean(axis=1) - np.pi), 0.0)
+        means = rule(members, channel).mean(axis=1)
+        # Halfway between 3.1 and -3.1 + 2 π
+        assert np.allclose(wrap(means - np.pi), 0.0)
     beliefs = [GaussianMixture.gaussian([m], [[1.0]]) for m in (3.1, -3.1)]
     for fused in target_fusion(beliefs, channel, target_dim=1):
         assert abs(wrap(fused.mean[0] - np.pi)) < 1e-9
@@ -492,6 +511,7 @@ def test_increments_of_information_on_the_receivers_branch() -> None:
     f = InformationIncrementFilter(still(), sensors, graphs.path(2), target_dim=1)
     priors = [GaussianMixture.gaussian([m], [[0.04]]) for m in (3.12, -3.12)]
     state = f.step(f.start(priors), 0.0, [[3.1], [-3.1]])
+    # Each agent has its prior and both observations, 3.1 and 2 π - 3.1 in one branch.
     information = 1 / 0.04 + 2 / 0.01
     for belief, prior in zip(state.mixtures, (3.12, -3.12 + TURN), strict=True):
         total = prior / 0.04 + (3.1 + TURN - 3.1) / 0.01
@@ -530,10 +550,12 @@ def test_a_transition_that_wraps_undeclared_warns_once(family: str) -> None:
         if family in ("coupling", "transport"):
             warnings.filterwarnings("ignore", message=".*effective size.*")
         state = f.step(start(f, [3.1], [[0.04]]), 1.0, [[-3.1]])
+    # The innovation from 3.1 to -3.1 by the shorter way is 2 π - 6.2.
     p = 0.04 + 1e-4
     gain = p / (p + 0.05**2)
-    want = 3.1 + gain * (TURN - 6.2)
-    assert abs(wrap(f.summarize(state).mean[0, 0] - want)) < tolerance(family)
+    expected = 3.1 + gain * (TURN - 6.2)
+    mean = f.summarize(state).mean[0, 0]
+    assert abs(wrap(mean - expected)) < tolerance(family)
 
 
 def test_predictions_lie_within_half_a_period_of_the_mean_s() -> None:
@@ -555,6 +577,7 @@ def test_predictions_of_a_compass_continue_the_line() -> None:
     headings = np.linspace(-30.0, 31.0, 62)[:, None]
     predicted = predict_points(compass(cut=True), headings)
     steps = np.diff(predicted[:, 0])
+    # Ten jumps of 2 π, at the odd multiples of π, are undone.
     assert np.allclose(steps, 1.0)
 
 
@@ -594,6 +617,7 @@ def test_the_page_s_wide_prior(family: str) -> None:
         f = WIDE_FILTERS[family](still_point, [sensor])
         state = f.start(WIDE_PRIOR, rng=np.random.default_rng(3), runs=(2000,))
         run = f.run(state, [1.0], [y], truth=truth, scores=("nees", "crps"))
+        # A component, the fraction of runs that are lost, and the CRPS: three cells of the table
         nees = run["nees"].values / 2
         values += [nees.mean(), 100 * (nees > 10).mean(), run["crps"].values.mean()]
     (row,) = re.findall(
@@ -625,6 +649,7 @@ def test_a_truth_that_wraps_undeclared_warns() -> None:
     turn = Model(1, lambda x, t, dt: x + 0.1 * dt, lambda t, dt: 1e-4 * dt * np.eye(1))
     f = GaussianFilter(turn, [compass(0.01)])
     state = f.start(([3.0], [[0.01]]))
+    # A truth that runs on, as the filter does, is right.
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         f.run(state, times, [wrap(truth)], truth=truth)
@@ -645,6 +670,7 @@ def test_a_large_first_error_is_no_wrap() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         run = f.run(state, np.arange(1.0, 121.0), [observed], truth=truth)
+    # K = P / (P + 1) with P = 2 π / (9 - 2 π), so that the mean falls by 9 K = 2 π.
     assert abs(run["mean"].values[1].item() - (9.0 - TURN)) < 1e-12
 
 
@@ -656,6 +682,7 @@ def test_what_does_not_wrap_is_not_warned_of() -> None:
 
     model = Model(1, jump, lambda t, dt: [[1e-4 * dt]])
     f = EnsembleFilter(model, [compass()], members=100)
+    # Members near zero on both sides: some jump and some do not.
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         f.step(start(f, [0.0], [[0.01]]), 1.0, [None])
@@ -674,6 +701,7 @@ def test_a_sensor_without_a_period_is_refused(family: str) -> None:
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_periods_that_do_not_fit_the_model_are_refused(family: str) -> None:
+    # 0.9 (x + 2 π) is not 0.9 x and whole turns.
     pulled = Model(
         1,
         lambda x, t, dt: 0.9 * x,

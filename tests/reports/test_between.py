@@ -18,7 +18,7 @@ import pytest
 
 from distfilt import filters
 from distfilt.filters import Observation
-from distfilt.models import Model, constant_velocity
+from distfilt.models import LinearModel, Model, constant_velocity
 from distfilt.network import covariance_intersection, graphs
 from distfilt.sensors import component
 
@@ -37,6 +37,7 @@ LATE = [
 
 def in_order(make: Any, prior: Any = PRIOR, model: Model = MOTION, **start: Any) -> Any:
     """Return the last state of a filter that gets all observations at their own times."""
+    # All are events at their own times, of which the filter makes its steps.
     f = make(model, [EYE])
     events = [Observation(t, 0, y) for t, y in zip(TIMES, SEEN, strict=True)]
     events += [Observation(late.t, 0, late.value) for late in LATE]
@@ -54,9 +55,43 @@ def test_gaussian_filters_are_exact(lag: int, linearization: Any) -> None:
     expected = in_order(make)
     assert np.allclose(state.means, expected.means, atol=1e-12)
     assert np.allclose(state.covariances, expected.covariances, atol=1e-12)
+    # Inserted times are kept in order, and do not appear in the record.
     assert len(state.times) <= lag
     assert list(state.times) == sorted(state.times)
     assert run["time"].values.tolist() == TIMES
+
+
+def frame(t: float) -> np.ndarray:
+    """Return axes that turn and stretch with time."""
+    return np.array([[1.0 + 0.3 * t, 0.2 * t], [-0.1 * t, np.exp(-0.2 * t)]])
+
+
+def move_with_frame() -> LinearModel:
+    """Return a random walk in the moving axes: two steps have the noise of one, at any time."""
+
+    def transition(t: float, dt: float) -> np.ndarray:
+        return frame(t + dt) @ np.linalg.inv(frame(t))
+
+    def noise_cov(t: float, dt: float) -> np.ndarray:
+        # x = A(t) w with w of covariance ∫ C dt
+        end = frame(t + dt)
+        return end @ (dt * np.array([[0.3, 0.1], [0.1, 0.2]])) @ end.T
+
+    return LinearModel.from_transition(2, transition, noise_cov)
+
+
+@pytest.mark.parametrize("linearization", ["extended", "unscented"])
+def test_a_model_that_depends_on_time_is_bridged_at_its_times(
+    linearization: Any,
+) -> None:
+    """Both parts of a step that is cut have the matrix and the noise of their own times."""
+    make = partial(filters.GaussianFilter, linearization=linearization)
+    model = move_with_frame()
+    f = make(model, [EYE], lag=5)
+    state = f.final_state(f.run(f.start(PRIOR), TIMES, [SEEN], delayed=LATE))
+    expected = in_order(make, model=model)
+    assert np.allclose(state.means, expected.means, atol=1e-12)
+    assert np.allclose(state.covariances, expected.covariances, atol=1e-12)
 
 
 @pytest.mark.parametrize("runs", [(), (3,)])
@@ -68,6 +103,7 @@ def test_each_time_between_is_kept_as_the_others_are(runs: tuple[int, ...]) -> N
     state = f.step(state, 2.0, [None], delayed=[Observation(1.3, 0, [1.1])])
     stepped = f.step(f.step(start, 1.0, [[0.8]]), 1.3, [[1.1]])
     stepped = f.step(stepped, 2.0, [[2.3]])
+    # The joint belief about all times, with their cross-covariances
     assert state.times == stepped.times == (0.0, 1.0, 1.3)
     assert np.allclose(state.joint_means, stepped.joint_means, atol=1e-12)
     assert np.allclose(state.joint_covariances, stepped.joint_covariances, atol=1e-12)
@@ -87,6 +123,7 @@ def test_members_tend_to_it(family: str) -> None:
     start = f.start(PRIOR, rng=np.random.default_rng(0))
     run = f.run(start, TIMES, [SEEN], delayed=LATE)
     expected = in_order(filters.GaussianFilter)
+    # A transport filter has 250 members in place of thousands.
     slack = 5.0 if family == "transport" else 1.0
     std = np.sqrt(np.diagonal(expected.covariances[0]))
     error = run["mean"].values[-1, 0] - expected.means[0]
@@ -99,6 +136,7 @@ def test_members_without_noise_are_exact() -> None:
     """A state between two is then known from either, and so are all moments."""
     still = constant_velocity(sigma=0.0, axes=1)
     f = filters.EnsembleFilter.exact(still, [EYE], members=60, lag=6)
+    # The Gaussian filter starts with the moments of the members.
     x = np.random.default_rng(0).standard_normal((60, 2))
     start = f.start(x, rng=np.random.default_rng(1))
     run = f.run(start, TIMES, [SEEN], delayed=LATE)
@@ -114,6 +152,7 @@ def test_agents_of_a_transport_filter_keep_their_members_in_common() -> None:
     state = f.start(PRIOR, rng=np.random.default_rng(0))
     state = f.step(state, 1.0, [[0.8], None])
     state = f.step(state, 2.0, [None, None], delayed=[Observation(0.4, 0, [0.6])])
+    # The state of the inserted time is drawn once, for all agents.
     assert (state.ensembles[0] == state.ensembles[1]).all()
     assert state.times == (0.0, 0.4, 1.0)
 
@@ -127,6 +166,7 @@ def test_a_network_exchanges_once_a_step_and_sends_the_late_one() -> None:
     plain = f.step(state, 2.0, [[2.3], None])
     late = [Observation(0.4, 0, [0.6]), Observation(1.5, 0, [1.4])]
     after = f.step(state, 2.0, [[2.3], None], delayed=late)
+    # The late ones travel in the messages of the step.
     assert after.ledger.rounds == plain.ledger.rounds
     assert after.ledger.messages.tolist() == plain.ledger.messages.tolist()
     assert (after.covariances[1] != plain.covariances[1]).any()
@@ -146,6 +186,7 @@ def test_a_nonlinear_model_is_right_to_first_order() -> None:
     late = f.step(state, 0.1, [None], delayed=[Observation(0.05, 0, [0.3])])
     start = f.start(PRIOR)
     stepped = f.step(f.step(start, 0.05, [[0.3]]), 0.1, [[0.1]])
+    # Derivatives are taken at slightly different states: errors of second order in 0.1 s
     assert np.allclose(late.means, stepped.means, atol=0.01)
     assert np.allclose(late.covariances, stepped.covariances, atol=0.01)
 
@@ -154,6 +195,7 @@ def test_times_outside_are_refused_by_name() -> None:
     f = filters.GaussianFilter(MOTION, [EYE], lag=1)
     start = f.start(PRIOR)
     state = f.step(f.step(start, 1.0, [[0.8]]), 2.0, [[2.3]])
+    # Before the oldest time that is kept; without any kept time; in smoothing; in a network
     with pytest.raises(ValueError, match="delayed must be of an earlier time"):
         f.step(state, 3.0, [None], delayed=[Observation(0.5, 0, [0.0])])
     none = filters.GaussianFilter(MOTION, [EYE])

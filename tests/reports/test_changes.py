@@ -69,15 +69,17 @@ def kalman(events: list[Event]) -> tuple[np.ndarray, np.ndarray]:
     m = np.tile(PRIOR[0], 3)
     p = np.tile(PRIOR[1], (3, 3))
     now = 0.0
+    # Rows of H by sensor: x₁ minus the first copy's, x₂ minus the second copy's, x₁ itself
     rows = np.zeros((3, 6))
-    rows[0, [0, 2]] = 1.0, -1.0
-    rows[1, [1, 5]] = 1.0, -1.0
+    rows[0, [0, 2]] = [1.0, -1.0]
+    rows[1, [1, 5]] = [1.0, -1.0]
     rows[2, 0] = 1.0
     for t in sorted({event[0] for event in events}):
         f = np.eye(6)
         f[:2, :2] = [[1.0, t - now], [0.0, 1.0]]
         q = np.zeros((6, 6))
         q[:2, :2] = WALK.Q(now, t - now)
+        # Copies stay where they are, without noise.
         m = f @ m
         p = f @ p @ f.T + q
         now = t
@@ -124,11 +126,11 @@ def observations(events: list[Event]) -> list[Observation]:
 def check(run: Any, events: list[Event], tolerance: float, agent: int = 0) -> None:
     mean, cov = kalman(events)
     std = np.sqrt(np.diag(cov))
-    found = run["mean"].values[-1, agent]
-    spread = np.sqrt(run["variance"].values[-1, agent])
+    last_mean = run["mean"].values[-1, agent]
+    last_std = np.sqrt(run["variance"].values[-1, agent])
     # In units of the right deviations.
-    assert np.abs((found - mean) / std).max() < 5 * tolerance
-    assert np.abs(spread / std - 1).max() < 2 * tolerance
+    assert np.abs((last_mean - mean) / std).max() < 5 * tolerance
+    assert np.abs(last_std / std - 1).max() < 2 * tolerance
 
 
 @EACH
@@ -153,6 +155,7 @@ def test_a_slow_odometer_and_a_fast_beacon(family: str) -> None:
     prior = ([0.0, 1.0], np.diag([0.01, 0.25]))
     run = f.run(f.start(prior, rng=np.random.default_rng(0)), None, events)
     x, v = run["mean"].values[-1, 0]
+    # At 1 m/s for 20 s; changes taken for those of a second would give 2 m/s.
     assert abs(v - 1) < 0.2
     assert abs(x - 20) < 0.6
 
@@ -167,6 +170,7 @@ def test_a_lag_keeps_what_it_is_asked_for(family: str) -> None:
     check(f.run(start, None, observations(events)), events, tolerance)
     state = f.step(start, 1.0, [[Observation(1.0, 0, [1.0], 2)]])
     state = f.step(state, 1.5, [[Observation(1.5, 0, [1.5], 2)]])
+    # The odometer has observed nothing yet, and still compares with the start.
     assert state.times == (1.0,)
     assert [t for t, _ in state.references] == [0.0]
 
@@ -177,14 +181,15 @@ def test_a_saved_state_goes_on_to_the_bit(family: str, tmp_path: Any) -> None:
     f = make(WALK, [SENSORS])
     events = observations(make_events())
     first = [event for event in events if event.t <= 5]
-    rest = [event for event in events if event.t > 5]
+    second = [event for event in events if event.t > 5]
     start = f.start(PRIOR, rng=np.random.default_rng(1))
     half = f.final_state(f.run(start, None, first))
     half.save(tmp_path / "half.npz")
     loaded = type(half).load(tmp_path / "half.npz")
-    whole = f.run(start, None, events)
-    run = f.run(loaded, None, rest)
-    assert (run["mean"].values == whole["mean"].values[5:]).all()
+    uninterrupted = f.run(start, None, events)
+    run = f.run(loaded, None, second)
+    # Steps 6 to 12, of which the first change reaches back before the pause
+    assert (run["mean"].values == uninterrupted["mean"].values[5:]).all()
 
 
 @EACH
@@ -219,6 +224,7 @@ def test_runs_that_miss_different_changes() -> None:
         present = np.flatnonzero(~np.isnan(y[:, r]))
         events = [(times[k], 0, y[k, r]) for k in present]
         mean, _ = kalman(events)
+        # A run without a last observation moves on for one second, x + v.
         if events[-1][0] < 4:
             mean = np.array([mean[0] + mean[1], mean[1]])
         error = run["mean"].values[-1, r, 0] - mean
@@ -226,9 +232,9 @@ def test_runs_that_miss_different_changes() -> None:
 
 
 def test_components_of_one_sensor_that_are_missing_one_by_one() -> None:
-    both = increment([0, 1], std=0.1)
-    still = Model(2, lambda x, t, dt: x + dt, lambda t, dt: 1e-6 * np.eye(2))
-    f = EnsembleFilter(still, [both], members=500)
+    pair = increment([0, 1], std=0.1)
+    steady = Model(2, lambda x, t, dt: x + dt, lambda t, dt: 1e-6 * np.eye(2))
+    f = EnsembleFilter(steady, [pair], members=500)
     start = f.start((np.zeros(2), 1e-4 * np.eye(2)), rng=np.random.default_rng(0))
     y = np.array(
         [
@@ -265,9 +271,10 @@ def test_families_without_earlier_states_refuse(make: Any) -> None:
     with pytest.raises(ValueError, match="sensors must not be increments"):
         make(WALK, [[ODOMETER, BEACON]], **options)
     f = make(WALK, [BEACON], **options)
-    own = Observation(1.0, 0, [1.0], ODOMETER)
+    # A sensor that comes with its observation has no earlier one.
+    private = Observation(1.0, 0, [1.0], ODOMETER)
     with pytest.raises(ValueError, match="observations must name one of the agent's"):
-        f.step(f.start(PRIOR), 1.0, [own])
+        f.step(f.start(PRIOR), 1.0, [private])
 
 
 def test_what_cannot_be_compared_is_refused_by_name() -> None:
@@ -280,12 +287,12 @@ def test_what_cannot_be_compared_is_refused_by_name() -> None:
     start = f.start(PRIOR, rng=np.random.default_rng(0))
     with pytest.raises(ValueError, match="observations of a sensor of changes must be"):
         f.step(start, 1.0, [[1.0], None])
-    alone = EnsembleFilter(WALK, [ODOMETER, None], graph, members=5)
+    without_lag = EnsembleFilter(WALK, [ODOMETER, None], graph, members=5)
     with pytest.raises(ValueError, match="previous must be the states at the previous"):
-        alone.step(start, 0.0, [[1.0], None])
-    own = Observation(1.0, 0, [1.0], ODOMETER)
+        without_lag.step(start, 0.0, [[1.0], None])
+    private = Observation(1.0, 0, [1.0], ODOMETER)
     with pytest.raises(ValueError, match="observations must name one of the agent's"):
-        f.step(start, 1.0, [own, None])
+        f.step(start, 1.0, [private, None])
 
 
 # After 4 s without an odometer a transport filter of so few members is too narrow: its variance
@@ -315,8 +322,8 @@ def test_a_change_that_is_not_there_moves_no_reference(family: str) -> None:
     make, tolerance = FAMILIES[family]
     f = make(WALK, [SENSORS])
     events = [event for event in make_events() if event[1] != 1]
-    kept = [event for event in events if event[:2] != (6.0, 0)]
-    seen = observations(kept)
+    others = [event for event in events if event[:2] != (6.0, 0)]
+    seen = observations(others)
     seen.append(Observation(6.0, 0, [np.nan], 0))
     start = f.start(PRIOR, rng=np.random.default_rng(1))
     # The change at 8 s is that since 4 s.
@@ -325,5 +332,8 @@ def test_a_change_that_is_not_there_moves_no_reference(family: str) -> None:
     )
     place = [(o.t, o.sensor) for o in seen].index((8.0, 0))
     seen[place] = Observation(8.0, 0, [change], 0)
-    whole = [(t, n, change if (t, n) == (8.0, 0) else v) for t, n, v in kept]
-    check(f.run(start, None, seen), whole, tolerance)
+    expected = []
+    for t, number, value in others:
+        is_next = (t, number) == (8.0, 0)
+        expected.append((t, number, change if is_next else value))
+    check(f.run(start, None, seen), expected, tolerance)

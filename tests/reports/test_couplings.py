@@ -45,6 +45,7 @@ def test_points_without_mass_do_not_matter(solver: Solver, far: float) -> None:
     padded = np.concatenate([x, np.full((3, 2), far)])
     masses = np.concatenate([a, np.zeros(3)])
     cost = squared_distances(padded, y)
+    # Three points more, which send nothing
     by_rows = transport_plan(cost, masses, b, solver=solver)
     assert np.abs(by_rows.matrix[:20] - expected.matrix).max() < 1e-9
     assert not by_rows.matrix[20:].any()
@@ -66,6 +67,7 @@ def test_forbidden_links_do_not_spoil_the_others(seed: int, forbidden: float) ->
     cost = squared_distances(x, y)
     is_diagonal = np.eye(12, dtype=bool)
     is_forbidden = (rng.random((12, 12)) < 0.4) & ~is_diagonal
+    # With equal masses an optimal plan is an assignment; 1e4 is dear enough to avoid a link.
     i, j = linear_sum_assignment(np.where(is_forbidden, 1e4, cost))
     expected = cost[i, j].mean()
     cost[is_forbidden] = forbidden
@@ -77,8 +79,10 @@ def test_forbidden_links_do_not_spoil_the_others(seed: int, forbidden: float) ->
     entropic = transport_plan(cost, np.full(12, 1 / 12), solver="entropic")
     assert not entropic.matrix[is_forbidden].any()
     assert np.abs(entropic.matrix.sum(axis=0) - 1 / 12).max() < 1e-14
-    allowed = np.ptp(cost[~is_forbidden])
-    assert expected < entropic.value < expected + 0.01 * allowed * np.log(144)
+    # It costs at most ε (max c - min c) log(n m) more, with ε of 0.01.
+    range_of_costs = np.ptp(cost[~is_forbidden])
+    largest_excess = 0.01 * range_of_costs * np.log(144)
+    assert expected < entropic.value < expected + largest_excess
 
 
 def test_a_published_cost_matrix_with_huge_entries() -> None:
@@ -94,8 +98,11 @@ def test_a_published_cost_matrix_with_huge_entries() -> None:
     )
     masses = np.array([0.125, 0.125, 0.125, 0.125, 0.5])
     plan = transport_plan(cost, masses, masses)
-    links = [0, 1, 2, 3, 4, 4, 4], [4, 4, 4, 3, 0, 1, 2]
-    assert plan.value == pytest.approx(0.125 * cost[links].sum(), rel=1e-9)
+    # Rows 0 to 2 send all to column 4, and row 4 sends to columns 0 to 2, 0.125 on each link.
+    rows = [0, 1, 2, 3, 4, 4, 4]
+    columns = [4, 4, 4, 3, 0, 1, 2]
+    expected = 0.125 * cost[rows, columns].sum()
+    assert plan.value == pytest.approx(expected, rel=1e-9)
 
 
 def test_links_that_are_needed_are_used() -> None:
@@ -106,6 +113,7 @@ def test_links_that_are_needed_are_used() -> None:
         plan = transport_plan(cost, masses, masses, solver=solver)
         assert np.abs(plan.matrix.sum(axis=1) - masses).max() < 1e-14
     plan = transport_plan(cost, masses, masses)
+    # The third row's cheapest link, at 2e9, takes all its mass.
     assert plan.matrix[2, 1] == pytest.approx(0.25)
 
 
@@ -119,6 +127,7 @@ def test_the_gap_of_a_plan_that_is_not_optimal_is_an_error(
     ) -> tuple[np.ndarray, np.ndarray]:
         return np.outer(a, b), np.zeros(b.size)
 
+    # The product of the masses is a plan, with potentials of zero.
     monkeypatch.setattr(solvers, "_solve_network", solve_badly)
     x = np.random.default_rng(0).normal(size=(6, 2))
     with pytest.raises(SolverError, match="is not optimal"):
@@ -129,6 +138,7 @@ def test_a_constant_cost_is_no_error() -> None:
     """Whatever its size, and points that all coincide."""
     for cost in (np.zeros((4, 4)), np.full((4, 4), 1e12), np.full((4, 4), 1e-12)):
         plan = transport_plan(cost, [0.1, 0.2, 0.3, 0.4])
+        # A total mass of one, at the one cost that there is
         assert plan.value == pytest.approx(float(cost[0, 0]))
 
 
@@ -151,6 +161,7 @@ def test_a_far_member_does_not_outweigh_the_others(far: float, weight: float) ->
     after = transform_ensemble(x[:, None], logs)[:, 0]
     assert after.mean() == pytest.approx(weights @ x, rel=1e-9, abs=1e-9)
     expected = transform_on_a_line(x, weights)
+    # But for the tie-breaker, in units of the distance to the far member
     assert np.abs(after - expected)[:29].max() < 1e-7 * far
 
 
@@ -196,18 +207,19 @@ def test_an_ensemble_without_far_members_is_solved_once(
 def test_two_far_clusters_are_transformed_alike() -> None:
     """Each by the linear programme of its own, in two dimensions."""
     rng = np.random.default_rng(4)
-    near = rng.normal(size=(8, 2))
-    part = rng.dirichlet(np.ones(8))
-    x = np.concatenate([near, near + [2e5, 0.0]])
-    weights = np.concatenate([part, part]) / 2
+    cluster = rng.normal(size=(8, 2))
+    masses = rng.dirichlet(np.ones(8))
+    x = np.concatenate([cluster, cluster + [2e5, 0.0]])
+    weights = np.concatenate([masses, masses]) / 2
     after = transform_ensemble(x, np.log(weights))
-    cost = squared_distances(near)
+    # Σ_j t_ij = a_i and Σ_i t_ij = 1/8 for the plan of one cluster, as rows of a matrix
+    cost = squared_distances(cluster)
     rows = np.kron(np.eye(8), np.ones(8))
     columns = np.kron(np.ones(8), np.eye(8))
-    sums = np.concatenate([part, np.full(8, 1 / 8)])
+    sums = np.concatenate([masses, np.full(8, 1 / 8)])
     constraints = np.vstack([rows, columns])
     plan = linprog(cost.ravel(), A_eq=constraints, b_eq=sums).x
-    expected = 8 * plan.reshape(8, 8).T @ near
+    expected = 8 * plan.reshape(8, 8).T @ cluster
     assert np.abs(after[:8] - expected).max() < 1e-6
     error = after[8:] - [2e5, 0.0] - expected
     assert np.abs(error).max() < 1e-6
@@ -218,21 +230,27 @@ def test_impossible_couplings_are_told_by_a_large_finite_cost(solver: Solver) ->
     """ott-jax/ott 165: infinity is refused by name; 1e12 is the linear program without the link."""
     rng = np.random.default_rng(4)
     cost = rng.random((6, 5))
-    rows, columns = np.full(6, 1 / 6), np.full(5, 1 / 5)
+    rows = np.full(6, 1 / 6)
+    columns = np.full(5, 1 / 5)
     is_forbidden = np.add.outer(np.arange(6), np.arange(5)) % 4 == 1
     infinite = np.where(is_forbidden, np.inf, cost)
     with pytest.raises(
         ValueError, match="cost must have finite numbers, got .* infinite"
     ):
         transport_plan(infinite, rows, columns, solver=solver)
-    sums = np.vstack([np.kron(np.eye(6), np.ones(5)), np.kron(np.ones(6), np.eye(5))])
+    # The sums of rows and columns are equations, and forbidden links have the bounds 0 and 0.
+    row_sums = np.kron(np.eye(6), np.ones(5))
+    column_sums = np.kron(np.ones(6), np.eye(5))
+    sums = np.vstack([row_sums, column_sums])
+    masses = np.concatenate([rows, columns])
     bounds = [(0, 0) if one else (0, None) for one in is_forbidden.ravel()]
-    exact = linprog(cost.ravel(), A_eq=sums, b_eq=np.r_[rows, columns], bounds=bounds)
+    exact = linprog(cost.ravel(), A_eq=sums, b_eq=masses, bounds=bounds)
     assert exact.status == 0
     large = np.where(is_forbidden, 1e12, cost)
     plan = transport_plan(large, rows, columns, solver=solver, regularisation=1e-3)
     assert not plan.matrix[is_forbidden].any()
     assert np.abs(plan.matrix.sum(axis=1) - rows).max() < 1e-12
+    # The entropy costs at most ε log(n m) of costs between zero and one.
     slack = 1e-9 if solver == "network" else 1e-3 * np.log(30)
     assert exact.fun - 1e-9 < plan.value < exact.fun + slack
 

@@ -53,6 +53,7 @@ def joint_density(seen: np.ndarray, transition: np.ndarray, q: np.ndarray) -> fl
     blocks = []
     for i in range(1, n + 1):
         blocks.append([covs[i, j] for j in range(1, n + 1)])
+    # y_k = x_k + noise of the same covariance at all times
     cov = np.block(blocks)
     cov += np.kron(np.eye(n), NOISE)
     present = ~np.isnan(seen.ravel())
@@ -70,6 +71,7 @@ def nis_of_kalman(seen: np.ndarray) -> list[float]:
     for y in seen:
         m = F @ m
         p = F @ p @ F.T + Q
+        # Rows of the components that are there
         present = ~np.isnan(y)
         h = np.eye(2)[present]
         if len(h):
@@ -93,6 +95,7 @@ def test_the_evidence_of_a_gaussian_filter_is_the_joint_density(
     )
     run = f.run(f.start((MEAN, COV)), TIMES, [SEEN])
     evidence = run["log_likelihood"].values[:, 0]
+    # Σ log p(y_k | y₁, …, y_{k-1}) = log p(y₁, …, y₅)
     assert np.isclose(evidence.sum(), joint_density(SEEN, F, Q), atol=1e-10)
     assert np.allclose(run["nis"].values[:, 0], nis_of_kalman(SEEN), atol=1e-10)
     assert run["n_observed"].values[:, 0].tolist() == [2, 2, 1, 0, 2]
@@ -111,6 +114,7 @@ def test_observations_that_come_late_have_the_same_evidence_in_sum() -> None:
     run = f.run(start, TIMES, [late], delayed=delayed)
     evidence = run["log_likelihood"].values
     assert np.isclose(evidence.sum(), joint_density(SEEN, F, Q), atol=1e-10)
+    # The first observation counts when it arrives, where the fourth is missing.
     assert evidence[0] == 0
     assert run["n_observed"].values[3, 0] == 2
 
@@ -123,10 +127,11 @@ def test_the_evidence_of_exact_ensembles_is_the_gaussian_filters(update: Any) ->
     )
     rng = np.random.default_rng(0)
     x = rng.standard_normal((40, 2))
+    # Whitened by their own moments, then given those of the prior: z ↦ m + L S⁻¹ (z - z̄)
     x -= x.mean(axis=0)
-    x = MEAN + x @ np.linalg.inv(np.linalg.cholesky(np.cov(x.T))).T @ (
-        np.linalg.cholesky(COV).T
-    )
+    sample_root = np.linalg.cholesky(np.cov(x.T))
+    white = np.linalg.solve(sample_root, x.T).T
+    x = MEAN + white @ np.linalg.cholesky(COV).T
     start = f.start(x, rng=rng, runs=(2,))
     other = SEEN + 1.0
     run = f.run(start, TIMES, [np.stack([SEEN, other], axis=1)])
@@ -148,9 +153,9 @@ def test_the_evidence_of_particles_is_the_mean_of_the_likelihoods() -> None:
     for y in SEEN:
         present = ~np.isnan(y)
         if present.any():
-            law = multivariate_normal(
-                np.zeros(present.sum()), NOISE[np.ix_(present, present)]
-            )
+            # N(y - x; 0, R) of the components that are there
+            block = NOISE[np.ix_(present, present)]
+            law = multivariate_normal(np.zeros(present.sum()), block)
             density *= law.pdf(y[present] - x[:, present])
     total = run["log_likelihood"].values.sum()
     assert np.isclose(total, np.log(density.mean()), atol=1e-10)
@@ -171,6 +176,7 @@ def test_agents_of_a_transport_filter_share_the_evidence_of_all_observations() -
     )
     start = f.start(x, rng=np.random.default_rng(0))
     state = f.step(start, 0.0, [[0.3], [-0.2]])
+    # The mean over the members of the product of both densities
     first = norm(x[:, 0], 0.5).pdf(0.3)
     second = norm(x[:, 1], 0.7).pdf(-0.2)
     density = first * second
@@ -199,6 +205,7 @@ def test_scores_are_of_the_observations_that_an_agent_assimilates(family: str) -
     )
     start = f.start((MEAN, COV), rng=np.random.default_rng(0))
     run = f.run(start, [1.0, 2.0], [[[1.0], [99.0]], [[0.2], [0.1]], None])
+    # By time and agent: agent 0's own, agent 1's own, and agent 1's at agent 2
     assert run["n_observed"].values.tolist() == [[1, 1, 1], [0, 1, 1]]
     assert run["rejected"].values.tolist() == [[0, 0, 0], [1, 0, 0]]
     assert (run["nis"].values < 10).all()
@@ -209,7 +216,7 @@ def test_scores_are_of_the_observations_that_an_agent_assimilates(family: str) -
 def test_consistent_filters_have_a_nis_of_the_number_of_observations(
     family: str,
 ) -> None:
-    """Over 4 000 runs its mean is 2, with a standard error of 2 / sqrt(4000)."""
+    """Over 2 000 steps its mean is 2, with a standard error of 2 / sqrt(2000)."""
     make = {
         "gaussian": filters.GaussianFilter,
         "ensemble": partial(filters.EnsembleFilter, members=400),
@@ -237,6 +244,7 @@ def test_a_run_that_fails_has_no_evidence() -> None:
     f = filters.GaussianFilter(wild, [BOTH], on_error="keep", record_evidence=True)
     start = f.start((MEAN, COV), runs=(2,))
     means = start.joint_means.copy()
+    # Where the model is not a number
     means[1] = 100.0
     run = f.run(start.replace(joint_means=means), [1.0], [[[1.0, 0.0]]])
     assert np.isfinite(run["log_likelihood"].values[0, 0, 0])
@@ -247,9 +255,9 @@ def test_saved_states_keep_the_scores(tmp_path: Any) -> None:
     f = filters.GaussianFilter(MOTION, [BOTH], record_evidence=True)
     state = f.step(f.start((MEAN, COV)), 1.0, [SEEN[0]])
     state.save(tmp_path / "state.npz")
-    again = filters.GaussianState.load(tmp_path / "state.npz")
-    assert again.log_likelihood == state.log_likelihood
-    assert again.nis == state.nis
+    loaded = filters.GaussianState.load(tmp_path / "state.npz")
+    assert loaded.log_likelihood == state.log_likelihood
+    assert loaded.nis == state.nis
 
 
 def test_families_that_cannot_refuse_the_option_by_name() -> None:

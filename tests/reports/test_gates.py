@@ -32,7 +32,8 @@ from distfilt.updates import enkf_exact, serially
 WALK = Model(1, lambda x, t, dt: x, lambda t, dt: 0.01 * dt * np.eye(1))
 EYE = component([0], std=0.3)
 PRIOR = ([0.0], [[1.0]])
-NEAR, FAR = [0.1], [40.0]
+NEAR = [0.1]
+FAR = [40.0]
 MESSAGE = rf"agent 0's has rejected the last {LIMIT} of kind 'component'"
 
 FAMILIES: dict[str, Any] = {
@@ -69,14 +70,14 @@ def make(family: str, **options: Any) -> tuple[Any, Any]:
 
 def steps_until_warned(f: Any, state: Any, values: list[Any]) -> tuple[list[int], Any]:
     """Return after which observations a warning of the gate came, and the last state."""
-    found = []
+    warned = []
     for k, value in enumerate(values, start=1):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             state = f.step(state, state.t + 1.0, value)
         if any("rejected the last" in str(one.message) for one in caught):
-            found.append(k)
-    return found, state
+            warned.append(k)
+    return warned, state
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -84,9 +85,9 @@ def test_a_lost_track_is_told_once_after_ten(family: str) -> None:
     """fusioncore 38: in a row; one that passes starts the count anew, a missing one does not."""
     f, state = make(family)
     values = [[NEAR], *[[FAR]] * 9, [NEAR], *[[FAR]] * 5, [None], *[[FAR]] * 9]
-    found, state = steps_until_warned(f, state, values)
+    warned, state = steps_until_warned(f, state, values)
     # 1 + 9 + 1 observations, then five, a gap, and the tenth after it
-    assert found == [11 + 5 + 1 + 5]
+    assert warned == [11 + 5 + 1 + 5]
     assert state.rejection_streaks[0, 0].tolist() == [14.0, 0.0]
 
 
@@ -95,8 +96,9 @@ def test_the_count_is_saved_and_so_is_what_was_said(tmp_path: Any) -> None:
     _, state = steps_until_warned(f, state, [[FAR]] * 6)
     state.save(tmp_path / "state.npz")
     state = type(state).load(tmp_path / "state.npz")
-    found, state = steps_until_warned(f, state, [[FAR]] * 6)
-    assert found == [4]
+    warned, state = steps_until_warned(f, state, [[FAR]] * 6)
+    # Six before the file and four after it are ten.
+    assert warned == [4]
     state.save(tmp_path / "state.npz")
     state = type(state).load(tmp_path / "state.npz")
     assert steps_until_warned(f, state, [[FAR]] * 12)[0] == []
@@ -133,6 +135,7 @@ def test_each_run_and_each_agent_counts_for_itself() -> None:
         graphs.path(2),
         gate_probability=0.999,
     )
+    # By run and agent
     means = np.array([[[0.0], [0.0]], [[50.0], [0.0]]])
     state = f.start(PRIOR, runs=(2,)).replace(joint_means=means)
     with pytest.warns(RuntimeWarning, match=f"{MESSAGE} from agent 1:") as caught:
@@ -164,7 +167,8 @@ def test_good_observations_of_others_do_not_hide_a_bad_source(
     for k in range(1, 14):
         good = Observation(float(k), 0, [0.0], sensor)
         bad = Observation(float(k), 1, FAR, sensor)
-        now, delayed = [[good], [bad]], []
+        now = [[good], [bad]]
+        delayed = []
         if lag:
             now = [[good], []]
             delayed = [Observation(k - 1.0, 1, FAR, sensor)] if k > 1 else []
@@ -199,9 +203,12 @@ def test_the_state_before_a_step_keeps_its_count(shares: bool) -> None:
         share_observations=shares,
     )
     before = f.step(f.start(PRIOR), 1.0, [FAR, NEAR])
-    again = [f.step(before, 2.0, [FAR, NEAR]).rejection_streaks for _ in range(2)]
+    # Two steps from one state do not count on.
+    first = f.step(before, 2.0, [FAR, NEAR]).rejection_streaks
+    second = f.step(before, 2.0, [FAR, NEAR]).rejection_streaks
     assert before.rejection_streaks.max() == 1
-    assert (again[0] == again[1]).all() and again[0].max() == 2
+    assert (first == second).all()
+    assert first.max() == 2
 
 
 def test_sensors_that_come_with_observations_are_counted_together() -> None:
@@ -235,6 +242,7 @@ def test_one_that_cannot_be_seen_ends_no_row_of_rejections() -> None:
         for k, sensor in enumerate(sensors, start=1):
             seen = [[Observation(k, 0, FAR, sensor)]]
             state = f.step(state, float(k), seen)
+    # Six rejections, one that is not seen, and three more
     assert state.rejection_streaks.tolist() == [[[9.0]]]
 
 
@@ -242,6 +250,7 @@ def test_a_reset_begins_anew() -> None:
     f, state = make("extended")
     _, state = steps_until_warned(f, state, [[FAR]] * 9)
     state = f.reset(state, [0], [0.0], [[1.0]])
+    # Nine before it and nine after it are no ten in a row.
     assert steps_until_warned(f, state, [[FAR]] * 9)[0] == []
     # A filter of other sensors counts from zero.
     other = filters.GaussianFilter(
@@ -271,4 +280,5 @@ def test_a_healthy_run_is_not_bothered() -> None:
     y = x + 0.3 * rng.standard_normal(800)
     with warnings.catch_warnings(action="error"):
         run = f.run(f.start(PRIOR), np.arange(1.0, 801.0), [y[:, None]])
+    # 80 of 800 are expected, with a standard deviation of sqrt(800 * 0.1 * 0.9) = 8.5.
     assert 40 < run["rejected"].values.sum() < 130

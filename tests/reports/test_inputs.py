@@ -46,6 +46,7 @@ def by_hand(heading: float, dt: float, u: np.ndarray) -> tuple[Any, Any]:
     """Return F and G of one piece."""
     c = np.cos(heading)
     s = np.sin(heading)
+    # x' = x + dt (v cos θ, v sin θ, ω) with u = (v, ω)
     distance = dt * u[0]
     f = np.array([[1, 0, -distance * s], [0, 1, distance * c], [0, 0, 1]])
     g = np.array([[dt * c, 0], [dt * s, 0], [0, dt]])
@@ -73,6 +74,7 @@ def test_steps_across_inputs_use_each_for_its_time() -> None:
     cov = np.zeros((3, 3))
     for _, dt, u in pieces:
         f, g = by_hand(x[2], dt, u)
+        # The noise of the earlier piece is moved by F.
         cov = f @ cov @ f.T + g @ SIGMA @ g.T
         x = drive(x, u, dt)
     assert np.allclose(ROBOT.step([1.0, -1.0, 0.3], 0.5, 1.25), x)
@@ -101,6 +103,7 @@ def test_members_are_draws_of_the_inputs(family: str) -> None:
     state = f.step(state, 1.5, [None])
     rng = np.random.default_rng(1)
     x = rng.multivariate_normal(*PRIOR, size=400_000)
+    # One draw for each input, which holds as long as it does
     for dt, u in ((1.0, [1.0, 0.2]), (0.5, [2.0, -0.1])):
         x = drive(x, u + rng.standard_normal((400_000, 2)) * [0.2, 0.1], dt)
     assert np.allclose(state.belief[0].mean(axis=0), x.mean(axis=0), atol=0.01)
@@ -113,6 +116,7 @@ def test_all_agents_of_a_transport_filter_draw_the_same() -> None:
     )
     start = f.start(PRIOR, rng=np.random.default_rng(0))
     state = f.step(start, 1.0, [None, None])
+    # Members in common need noise in common.
     assert (state.belief[0] == state.belief[1]).all()
 
 
@@ -136,10 +140,10 @@ def test_filters_of_filterpy_have_the_inputs_noise(
 
 def test_further_noise_is_added() -> None:
     extra = 0.3 * np.eye(3)
-    both = InputModel.from_inputs(3, drive, ODOMETRY, lambda t, dt: dt * extra)
-    difference = both.noise_at([0, 0, 0.7], 0.0, 1.0) - ROBOT.noise_at(
-        [0, 0, 0.7], 0.0, 1.0
-    )
+    noisier = InputModel.from_inputs(3, drive, ODOMETRY, lambda t, dt: dt * extra)
+    x = [0.0, 0.0, 0.7]
+    # In one second
+    difference = noisier.noise_at(x, 0.0, 1.0) - ROBOT.noise_at(x, 0.0, 1.0)
     assert np.allclose(difference, extra)
 
 

@@ -57,6 +57,7 @@ def test_axes_of_different_units_have_a_width_each(rule: Rule) -> None:
     by_scipy = gaussian_kde(x.T, "silverman")(BOX.centres.T)
     h = bandwidth(x, BOX, rule=rule)
     estimate = kernel_density(x, BOX, bandwidth=h)
+    # ∫ |p̂ - p| dx, for this estimate and for scipy's
     error = np.abs(estimate - true).sum() * BOX.volume
     expected = np.abs(by_scipy - true).sum() * BOX.volume
     assert error < 1.1 * expected
@@ -87,6 +88,7 @@ def test_a_width_for_each_axis_is_a_product_of_kernels(shape: tuple[int, ...]) -
     second = kernels(x[:, 1:], line, bandwidth=widths[:, 1])
     expected = (first[:, :, None] * second[:, None, :]).reshape(5, -1)
     assert np.allclose(z, expected, atol=1e-12)
+    # The density is the mean of the agents' kernels.
     mean = kernel_density(x, UNIT, bandwidth=h)
     assert np.allclose(mean, z.mean(axis=0), atol=1e-12)
 
@@ -104,6 +106,7 @@ def test_constants_of_kernels_with_a_width_for_each_axis() -> None:
     unit_mean, unit_cov = kernel_covariance(
         1000 * p, Grid((10, 10)), bandwidth=0.1, agents=4
     )
+    # Densities are per 1000 units of area, and their covariance per 1000².
     assert np.allclose(1000 * mean, unit_mean)
     assert np.allclose(1e6 * cov, unit_cov)
     snapshot = SwarmSnapshot(np.array([[500.0, 0.5]]), BOX, h, 0.0)
@@ -127,8 +130,8 @@ def test_rounded_positions_have_the_width_of_exact_ones(step: float, seed: int) 
     """On two clusters, in an L2 error near that of the best width of all."""
     grid = Grid((60, 60))
     rng = np.random.default_rng(seed)
-    left = rng.random((300, 1)) < 0.5
-    centre = np.where(left, [0.3, 0.5], [0.7, 0.5])
+    is_left = rng.random((300, 1)) < 0.5
+    centre = np.where(is_left, [0.3, 0.5], [0.7, 0.5])
     x = (centre + 0.08 * rng.normal(size=(300, 2))).clip(0, 1)
     x = np.round(x / step) * step
     true = np.zeros(grid.size)
@@ -147,6 +150,7 @@ def test_strongly_rounded_positions_on_a_line() -> None:
     """A step of half a deviation: the least candidate would show every tie as a peak."""
     line = Grid((200,), low=-5.0, high=5.0)
     x = np.random.default_rng(1).normal(size=(1000, 1)).clip(-5, 5)
+    # The width of the positions before they are rounded to halves
     exact = bandwidth(x, line, rule="least_squares")
     true = norm.pdf(line.centres[:, 0])
     rounded = np.round(2 * x) / 2
@@ -161,4 +165,5 @@ def test_agents_in_one_place_are_left_out_together() -> None:
     x = draw_agents(150)
     single = bandwidth(x, UNIT, rule="least_squares")
     twice = bandwidth(np.concatenate([x, x]), UNIT, rule="least_squares")
+    # A width that saw the copies as a peak would be the smallest one that is tried.
     assert 0.6 * single < twice < 1.7 * single

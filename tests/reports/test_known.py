@@ -62,14 +62,17 @@ def test_gaussian_filters_know_a_constant(linearization: Any, lag: int) -> None:
     long = make(LONG, [BIASED], kappa=1.0)
     short = make(SHORT, [SQUARE], kappa=2.0)
     method = "smooth" if lag else "run"
+    # Observations with the bias, and a filter that knows it, against those without it
     a = getattr(long, method)(long.start(WITH_BIAS), TIMES, [SEEN + BIAS])
     b = getattr(short, method)(short.start(PRIOR), TIMES, [SEEN])
-    assert np.allclose(a["mean"].values[..., :2], b["mean"].values, atol=1e-10)
-    assert np.allclose(
-        a["covariance"].values[..., :2, :2], b["covariance"].values, atol=1e-10
-    )
-    assert (a["mean"].values[..., 2] == BIAS).all()
-    assert (a["variance"].values[..., 2] == 0).all()
+    mean = a["mean"].values
+    covariance = a["covariance"].values
+    assert np.allclose(mean[..., :2], b["mean"].values, atol=1e-10)
+    block = covariance[..., :2, :2]
+    assert np.allclose(block, b["covariance"].values, atol=1e-10)
+    # The constant stays, to the bit.
+    assert (mean[..., 2] == BIAS).all()
+    assert (covariance[..., 2, 2] == 0).all()
 
 
 def test_a_covariance_that_is_not_one_still_ends_the_run() -> None:
@@ -96,6 +99,7 @@ def test_kalman_filter_and_smoother_know_a_constant() -> None:
     short = kalman_filter(*PRIOR, SEEN, F=f, Q=Q, H=[[1.0, 0.0]], **noise)
     smooth_long = rts_smoother(long, F=long_f, Q=np.pad(Q, ((0, 1), (0, 1))))
     smooth_short = rts_smoother(short, F=f, Q=Q)
+    # The blocks of the first two components, filtered and smoothed
     for a, b in ((long, short), (smooth_long, smooth_short)):
         assert np.allclose(a.means[..., :2], b.means, atol=1e-12)
         assert np.allclose(a.covariances[..., :2, :2], b.covariances, atol=1e-12)
@@ -126,13 +130,15 @@ def test_rules_of_fusion_know_a_constant(name: str) -> None:
     # The constant is the middle component.
     long_covs[np.ix_(range(4), [0, 2], [0, 2])] = covs
     long_means = np.insert(means, 1, BIAS, axis=1)
-    a = RULES[name]((long_means, long_covs), Channel(graphs.ring(4)))
-    b = RULES[name]((means, covs), Channel(graphs.ring(4)))
-    assert np.allclose(a[0][:, [0, 2]], b[0], atol=1e-12)
+    rule = RULES[name]
+    fused_means, fused_covs = rule((long_means, long_covs), Channel(graphs.ring(4)))
+    short_means, short_covs = rule((means, covs), Channel(graphs.ring(4)))
+    # The other components are fused as if the constant were not there.
+    assert np.allclose(fused_means[:, [0, 2]], short_means, atol=1e-12)
     block = np.ix_(range(4), [0, 2], [0, 2])
-    assert np.allclose(a[1][block], b[1], atol=1e-12)
-    assert (a[0][:, 1] == BIAS).all()
-    assert not a[1][:, 1].any()
+    assert np.allclose(fused_covs[block], short_covs, atol=1e-12)
+    assert (fused_means[:, 1] == BIAS).all()
+    assert not fused_covs[:, 1].any()
 
 
 @pytest.mark.parametrize("name", [name for name in RULES if name != "pull"])
@@ -166,13 +172,12 @@ def test_networks_of_filters_fuse_beside_a_constant(linearization: Any) -> None:
     g = filters.GaussianFilter(short, eyes, graphs.path(2), **options)
     seen = [[[1.0], [0.5]], [[0.2], [0.1]]]
     start = f.start(([0.0, 3.0], np.diag([1.0, 0.0])))
-    a = f.run(start, [1.0, 2.0], seen)
+    mean = f.run(start, [1.0, 2.0], seen)["mean"].values
     start = g.start(([0.0], [[1.0]]))
-    b = g.run(start, [1.0, 2.0], seen)
-    a_mean = a["mean"].values[..., 0]
-    b_mean = b["mean"].values[..., 0]
-    assert np.allclose(a_mean, b_mean, atol=1e-12)
-    assert np.allclose(a["mean"].values[..., 1], 3.0)
+    # The filter of the first component alone
+    expected = g.run(start, [1.0, 2.0], seen)["mean"].values
+    assert np.allclose(mean[..., :1], expected, atol=1e-12)
+    assert np.allclose(mean[..., 1], 3.0)
 
 
 @pytest.mark.parametrize(
@@ -193,6 +198,7 @@ def test_mixtures_refuse_it_by_name(make: Any) -> None:
 def test_ensembles_are_intersected_beside_a_constant(rule: Any, scale: Any) -> None:
     rng = np.random.default_rng(0)
     x = rng.standard_normal((2, 4, 9, 2)) + rng.standard_normal((2, 4, 1, 2))
+    # A constant of 0.1 between the two components, in all members of all agents
     long = np.insert(x, 1, 0.1, axis=-1)
     options: dict[str, Any] = {"rule": rule, "rounds": 2}
     short_scale = None if scale is None else [scale[0], scale[2]]
@@ -223,6 +229,7 @@ def test_networks_of_exact_ensembles_know_a_constant() -> None:
     g = filters.GaussianFilter(
         LONG_WALK, [LINEAR_BIASED] * 2, graphs.path(2), fusion=fusion
     )
+    # It starts with the sample moments of the members.
     sample_cov = np.cov(state.ensembles[0].T)
     prior = [(e.mean(axis=0), np.cov(e.T)) for e in state.ensembles]
     assert np.allclose(sample_cov[2], 0.0, atol=1e-28)

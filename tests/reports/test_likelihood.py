@@ -73,6 +73,7 @@ def grid_moments(log_density: Any, seen: list[float]) -> tuple[float, float]:
     for y in seen:
         observed = np.full((GRID.size, 1), y)
         logs = logs + log_density(GRID[:, None], observed)
+    # p(x | y) ∝ p(x) Π p(y | x), normalised on the grid
     w = np.exp(logs - logs.max())
     w /= w.sum()
     mean = float(w @ GRID)
@@ -97,6 +98,7 @@ def test_the_posterior_is_that_of_a_grid(family: str, case: str) -> None:
     start = f.start(([1.0], [[1.0]]), rng=np.random.default_rng(0))
     run = f.run(start, [1.0, 2.0, 3.0], [np.array(seen)[:, None]])
     mean, variance = grid_moments(log_density, seen)
+    # A transport filter has 300 members in place of 20 000.
     slack = 1.0 if family.startswith("particle") else 3.0
     last_mean = run["mean"].values[-1, 0, 0]
     last_variance = run["variance"].values[-1, 0, 0]
@@ -115,6 +117,7 @@ def test_a_late_count_is_that_of_its_own_time(family: str) -> None:
     state = f.step(state, 1.0, [None])
     late = Observation(0.0, 0, [6.0])
     after = f.summarize(f.step(state, 1.0, [None], delayed=[late]))
+    # The belief about the first time is doubled: twice the mean and four times the variance.
     mean, variance = grid_moments(log_count, [6.0])
     assert abs(after.mean[0, 0] - 2 * mean) < 0.15
     assert abs(after.variance[0, 0] / (4 * variance) - 1) < 0.3
@@ -138,18 +141,19 @@ def test_the_nis_is_unknown_without_moments_and_its_numbers_count(family: str) -
     members = np.array([[-1.0], [1.0]])
     start = f.start(members, rng=np.random.default_rng(0))
     pair = [Observation(0.0, 0, [1.5]), Observation(0.0, 0, [0.2], 1)]
-    both = [pair, [Observation(0.0, 1, [0.3])]]
-    alone = [pair[:1], None]
+    with_likelihoods = [pair, [Observation(0.0, 1, [0.3])]]
+    gaussian_only = [pair[:1], None]
     shares = family != "transport"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", filters.ParticleCollapse)
-        state = f.step(start, 0.0, both)
-        plain = f.step(start, 0.0, alone)
+        state = f.step(start, 0.0, with_likelihoods)
+        plain = f.step(start, 0.0, gaussian_only)
     # Particle filters share observations, transport filters do not.
     assert state.n_observed.tolist() == ([3, 3] if shares else [2, 1])
     assert np.isnan(state.nis).all()
     assert np.isfinite(state.log_likelihood).all()
     assert plain.n_observed.tolist() == ([1, 1] if shares else [1, 0])
+    # r² / S; an agent without an observation has zero.
     expected = 1.5**2 / ((1.0 if shares else 2.0) + 0.25)
     assert np.allclose(plain.nis, [expected, expected if shares else 0.0])
     # A missing observation of such a sensor is none.
@@ -172,6 +176,7 @@ def test_the_nis_of_runs_in_which_different_observations_are_missing(
     z = np.array([[0.3], [np.nan], [0.4]])
     start = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0), runs=(3,))
     state = f.step(start, 0.0, [[Observation(0.0, 0, y), Observation(0.0, 0, z, 1)]])
+    # In the second run the likelihood is missing, so that only there the NIS is a number.
     assert state.n_observed[:, 0].tolist() == [2, 1, 1]
     assert np.isnan(state.nis[:, 0]).tolist() == [True, False, True]
 
@@ -202,6 +207,7 @@ def test_weights_are_products_of_densities() -> None:
         * poisson.pmf(5, np.exp(x[:, 0]))
     )
     assert np.allclose(state.weights, expected / expected.sum(), atol=1e-14)
+    # The evidence is the mean of the likelihoods over equally weighted particles.
     assert np.allclose(state.log_likelihood, np.log(expected.mean()), atol=1e-12)
     assert state.n_observed.tolist() == [3, 3]
     assert state.ledger.messages.tolist() == [1, 0]
@@ -210,6 +216,7 @@ def test_weights_are_products_of_densities() -> None:
 def test_the_gate_has_the_spread_of_the_rates_and_of_the_counts() -> None:
     """Var y = E rate + Var rate, which is the mean of the variances and the variance of means."""
     x = np.array([[0.0], [1.0], [2.0]])
+    # A Poisson count has the variance of its rate.
     rates = np.exp(x[:, 0])
     spread = rates.mean() + rates.var()
     # The chi-squared quantile of 0.95 with one degree is 3.841.
@@ -235,6 +242,7 @@ def test_runs_that_miss_the_count_keep_their_weights() -> None:
     f = ParticleFilter(STILL, [COUNTER], members=9)
     start = f.start(x, rng=np.random.default_rng(0), runs=(2,))
     state = f.step(start, 0.0, [[[3.0], [np.nan]]])
+    # The first run has the weights of the count's density, the second its equal ones.
     w = poisson.pmf(3, np.exp(x[:, 0]))
     assert np.allclose(state.weights[0, 0], w / w.sum())
     assert np.allclose(state.weights[1, 0], 1 / 9)
@@ -250,6 +258,7 @@ def test_particles_that_make_a_count_impossible_lose_their_weight() -> None:
     x = np.array([[-1.0], [1.0], [-2.0], [2.0]])
     start = f.start(x, rng=np.random.default_rng(0))
     state = f.step(start, 0.0, [[1.0]])
+    # Positive are the second and the fourth.
     assert np.allclose(state.weights, [[0, 0.5, 0, 0.5]])
     with pytest.raises(filters.FilterError, match="likelihood of zero"):
         f.step(f.start(-abs(x), rng=np.random.default_rng(0)), 0.0, [[1.0]])
@@ -302,6 +311,7 @@ def test_what_it_cannot_do_is_refused_by_name() -> None:
 
 def test_draws_and_predictions_are_its_own() -> None:
     drawn = COUNTER.observe(np.full((20_000, 1), 1.0), rng=np.random.default_rng(0))
+    # A Poisson distribution of rate e: standard errors of 0.012 and 0.029
     assert abs(drawn.mean() - np.e) < 0.05
     assert abs(drawn.var() - np.e) < 0.15
     assert np.allclose(COUNTER.predict([[0.0], [1.0]]), [[1.0], [np.e]])

@@ -44,6 +44,7 @@ def gain_by_matrices(
     x: np.ndarray, places: np.ndarray, radius: float, r: np.ndarray
 ) -> np.ndarray:
     """Return the gain of direct observations from the sample covariance times the taper."""
+    # K = (ρ ∘ P) (ρ ∘ P + R)⁻¹, as H is the identity
     distance = np.linalg.norm(places[:, None] - places, axis=-1)
     covariance = gaspari_cohn(distance / radius) * np.cov(x.T)
     return covariance @ np.linalg.inv(covariance + r)
@@ -72,6 +73,7 @@ def test_rounding_in_the_noise_changes_nothing() -> None:
     """Also for an update that is not by a gain."""
     x = draw(5, 30, 2)
     places = [[0.0], [1.5]]
+    # A transport has no gain; its predictions are made again after each observation.
     local = updates.with_localization(
         updates.etpf, places=places, observation_places=places, radius=1.0
     )
@@ -99,9 +101,8 @@ def test_whitened_observations_are_near_the_joint_update() -> None:
         y = x.mean(axis=0) + innovation
         moved = local(x, x, y, r, rng=np.random.default_rng(0)) - x
         expected = gain_by_matrices(x, places, 1.5, r) @ innovation
-        errors.append(
-            np.linalg.norm(moved.mean(axis=0) - expected) / np.linalg.norm(expected)
-        )
+        error = np.linalg.norm(moved.mean(axis=0) - expected)
+        errors.append(error / np.linalg.norm(expected))
     assert np.mean(errors) < 0.1
 
 
@@ -120,6 +121,7 @@ def test_a_missing_one_of_correlated_observations_is_left_out() -> None:
             [np.nan, np.nan],
         ]
     )
+    # Three ensembles: with both observations, with the second one, without any
     after = updates.with_missing(local, x, x, y, r, rng=np.random.default_rng(0))
     single = updates.with_localization(
         ETKF, places=places, observation_places=places[1:], radius=1.0
@@ -138,17 +140,18 @@ def test_of_three_correlated_observations_one_may_be_missing(missing: int) -> No
     places = np.array([[0.0], [0.8], [1.5]])
     r = np.array([[1.0, 0.6, 0.3], [0.6, 1.5, 0.7], [0.3, 0.7, 2.0]])
     y = np.array([1.0, 2.0, -1.0])
-    rest = np.delete(np.arange(3), missing)
+    present = np.delete(np.arange(3), missing)
     y[missing] = np.nan
     local = updates.with_localization(
         ETKF, places=places, observation_places=places, radius=1.0
     )
     after = updates.with_missing(local, x, x, y, r, rng=np.random.default_rng(0))
     without = updates.with_localization(
-        ETKF, places=places, observation_places=places[rest], radius=1.0
+        ETKF, places=places, observation_places=places[present], radius=1.0
     )
-    r_rest = r[np.ix_(rest, rest)]
-    expected = without(x, x[:, rest], y[rest], r_rest, rng=np.random.default_rng(0))
+    block = r[np.ix_(present, present)]
+    rng = np.random.default_rng(0)
+    expected = without(x, x[:, present], y[present], block, rng=rng)
     assert np.allclose(after, expected, atol=1e-12)
 
 
@@ -164,9 +167,10 @@ def test_each_axis_has_its_period() -> None:
         period=[360.0, np.nan],
     )
     after = local(x, x[:, :1], [1.0], [[0.5]], rng=np.random.default_rng(0))
-    whole = ETKF(x, x[:, :1], [1.0], [[0.5]], rng=np.random.default_rng(0))
+    untapered = ETKF(x, x[:, :1], [1.0], [[0.5]], rng=np.random.default_rng(0))
+    # At 2 degrees of a radius of 2 the taper is 5/24; the others are 359 and 179 away.
     rho = np.array([5 / 24, 0.0, 0.0])
-    assert np.allclose(after - x, rho * (whole - x), atol=1e-12)
+    assert np.allclose(after - x, rho * (untapered - x), atol=1e-12)
     with pytest.raises(ValueError, match="^period must be positive"):
         updates.with_localization(
             ETKF,
@@ -206,6 +210,7 @@ def test_places_of_sensors_on_a_ring(by_function: bool) -> None:
     state = f.start((np.zeros(4), np.eye(4)), rng=np.random.default_rng(0))
     after = f.step(state, 0.0, [[3.0], [np.nan], [1.0], [2.0]])
     y = np.array([3.0, 0.0, 1.0, 2.0])
+    # Agent i of the ring hears i - 1 and i + 1; agent 1's observation is missing.
     receives = np.array(
         [
             [1, 0, 0, 1],
@@ -230,12 +235,14 @@ def test_lost_observations_keep_the_places_of_the_others() -> None:
     state = f.start((np.zeros(4), np.eye(4)), runs=(20,), rng=np.random.default_rng(0))
     after = f.step(state, 0.0, [[3.0], [2.0], [1.0], [2.0]])
     changed = (after.ensembles != state.ensembles).any(axis=-2)
-    own = changed[:, range(4), range(4)]
-    opposite = changed[:, range(4), [2, 3, 0, 1]]
-    neighbour = changed[:, range(4), [1, 2, 3, 0]]
-    assert own.all()
-    assert not opposite.any()
-    assert 0.3 < neighbour.mean() < 0.7
+    # By run, agent and component, which is the agent's that observes it
+    of_itself = changed[:, range(4), range(4)]
+    of_opposite = changed[:, range(4), [2, 3, 0, 1]]
+    of_neighbour = changed[:, range(4), [1, 2, 3, 0]]
+    assert of_itself.all()
+    assert not of_opposite.any()
+    # Half of 80 messages are lost on average, with a deviation of 0.056 in the share.
+    assert 0.3 < of_neighbour.mean() < 0.7
     # What comes, comes to its place.
     y = np.array([3.0, 2.0, 1.0, 2.0])
     mean = state.ensembles.mean(axis=-2)
@@ -270,6 +277,7 @@ def test_a_sensor_without_a_place_is_named() -> None:
     with pytest.raises(ValueError, match="^observation_places must be given"):
         f.update(*data, rng=np.random.default_rng(0))
     after = f.update(*data, rng=np.random.default_rng(0), observation_places=[[0.0]])
+    # The other components are ten radii away.
     assert (after[:, 1:] == x[:, 1:]).all()
 
 

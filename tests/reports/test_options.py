@@ -79,6 +79,7 @@ def outcome(make: Callable[..., Any], options: dict[str, Any]) -> Any:
         run = f.run(start, TIMES, series)
     except (filters.FilterError, ValueError) as error:
         return type(error).__name__
+    # All variables of the record, and the times that the last state keeps
     last = f.final_state(run)
     result = {name: np.asarray(run[name].values) for name in run.variables}
     result["times"] = np.array(last.times)
@@ -384,12 +385,14 @@ PAIRS = [(family, name) for family, (_, _, cases) in CASES.items() for name in c
 @pytest.mark.parametrize("family", CASES)
 def test_every_field_has_a_case(family: str) -> None:
     cls, _, cases = CASES[family]
+    # A new option without a case fails here.
     names = {field.name for field in fields(cls) if field.init}
     assert names == set(cases)
 
 
 def test_every_family_of_the_package_has_cases() -> None:
     public = [getattr(filters, name) for name in filters.__all__]
+    # Families that can be made, without the bases that they share
     concrete = {
         cls
         for cls in public
@@ -405,11 +408,12 @@ def test_every_family_of_the_package_has_cases() -> None:
 @pytest.mark.parametrize(("family", "name"), PAIRS)
 def test_another_value_of_an_option_changes_a_run(family: str, name: str) -> None:
     cls, base, cases = CASES[family]
-    both, second = cases[name]
-    before = outcome(cls, {**base, **both})
-    after = outcome(cls, {**base, **both, **second})
+    common, second = cases[name]
+    before = outcome(cls, {**base, **common})
+    after = outcome(cls, {**base, **common, **second})
+    # Only without `on_error` a run fails, and never with the second options.
     assert isinstance(before, str) == (name == "on_error"), before
     assert not isinstance(after, str), after
     assert differ(before, after)
     # The comparison itself sees equal runs as equal.
-    assert not differ(after, outcome(cls, {**base, **both, **second}))
+    assert not differ(after, outcome(cls, {**base, **common, **second}))

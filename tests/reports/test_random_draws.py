@@ -66,10 +66,11 @@ def test_rows_of_any_distribution_are_those_of_the_whole_batch(name: str) -> Non
     """numpy's own draws for all rows, of which some are selected."""
     arguments = ARGUMENTS.get(name, ())
     draw = getattr(np.random.default_rng(np.random.PCG64(1)), name)
-    whole = draw(*arguments, size=(*LEAD, 4, 2))
-    whole = whole.reshape(6, *whole.shape[2:])
+    batch = draw(*arguments, size=(*LEAD, 4, 2))
+    # Two by three leading entries are six rows.
+    by_row = batch.reshape(6, *batch.shape[2:])
     part = getattr(for_rows(), name)(*arguments, size=(3, 4, 2))
-    assert np.array_equal(part, whole[ROWS])
+    assert np.array_equal(part, by_row[ROWS])
     # Rows have different draws.
     assert not np.array_equal(part[0], part[1])
 
@@ -84,6 +85,7 @@ def test_every_method_of_numpy_is_covered() -> None:
 def test_parameters_of_each_row() -> None:
     """Without a size it is the parameters'; numbers for each row stay with their rows."""
     x = np.arange(24.0).reshape(3, 4, 2)
+    # loc + scale z, and low + (high - low) u, with the rows' own z and u
     normal = np.random.default_rng(np.random.PCG64(1)).normal(size=(6, 4, 2))[ROWS]
     assert np.allclose(for_rows().normal(x, 0.5), x + 0.5 * normal)
     uniform = np.random.default_rng(np.random.PCG64(1)).random((6, 4, 2))[ROWS]
@@ -92,6 +94,7 @@ def test_parameters_of_each_row() -> None:
     assert np.allclose(drawn, low + 2.0 * uniform)
     result = np.empty((3, 2))
     assert for_rows().standard_normal(out=result, size=(3, 2)) is result
+    # The mean of each row, over nine counts
     counts = for_rows().poisson(np.array([[0.0], [1e3], [1e6]]), (3, 9))
     assert (counts[0] == 0).all()
     assert np.allclose(counts[1:].mean(axis=1), [1e3, 1e6], rtol=0.1)
@@ -130,11 +133,12 @@ def test_runs_that_miss_different_components_have_their_own_draws(name: str) -> 
     after = with_missing(add_noise, x, h, y, np.eye(2), rng=np.random.default_rng(0))
     for a, b in ((0, 1), (0, 2), (1, 2)):
         assert (after[a] != after[b]).any()
-    alike = np.array([[1.0, np.nan]] * 3)
-    other = with_missing(
-        add_noise, x, h, alike, np.eye(2), rng=np.random.default_rng(0)
+    # All runs miss the same component.
+    y_of_all = np.array([[1.0, np.nan]] * 3)
+    together = with_missing(
+        add_noise, x, h, y_of_all, np.eye(2), rng=np.random.default_rng(0)
     )
-    assert np.array_equal(after, other)
+    assert np.array_equal(after, together)
 
 
 @pytest.mark.parametrize("stacks", [False, True])
@@ -154,5 +158,6 @@ def test_runs_of_a_filter_have_their_own_draws(name: str, stacks: bool) -> None:
     state = f.start(prior, runs=(3,), rng=np.random.default_rng(0))
     y = np.array([[1.0, np.nan], [np.nan, 1.0], [1.0, 1.0]])
     after = f.step(state, 0.0, [y]).ensembles[:, 0] - state.ensembles[:, 0]
+    # No two runs have the same changes of their members.
     for a, b in ((0, 1), (0, 2), (1, 2)):
         assert (np.abs(after[a] - after[b]) > 1e-9).any()

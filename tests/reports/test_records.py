@@ -47,6 +47,7 @@ def run(**options: Any) -> xarray.Dataset:
 
 
 def nees(agent: int, error: np.ndarray, index: list[int]) -> float:
+    # eᵀ P⁻¹ e of the components in the index, whose covariance is their block
     cov = COVS[agent][np.ix_(index, index)]
     return float(error @ np.linalg.inv(cov) @ error)
 
@@ -57,7 +58,7 @@ def test_truth_with_gaps_in_every_form(form: str) -> None:
     gaps = TRUTH.copy()
     gaps[1] = np.nan
     gaps[2, 1] = np.nan
-    known = {
+    forms = {
         "array": gaps,
         "function": lambda t: gaps[np.flatnonzero(t == TIMES)[0]],
         "names": {name: gaps[:, k] for k, name in enumerate(NAMES)},
@@ -67,20 +68,24 @@ def test_truth_with_gaps_in_every_form(form: str) -> None:
             for k, name in enumerate(NAMES)
         },
     }
-    record = run(truth=known[form])
+    record = run(truth=forms[form])
     squared = (MEANS - gaps[:, None]) ** 2
     assert np.allclose(record["squared_error"], squared, equal_nan=True)
     for agent in range(2):
         expected = nees(agent, MEANS[agent] - TRUTH[0], [0, 1, 2])
-        found = record["nees"].values[:, agent]
-        assert np.isclose(found[0], expected) and np.isnan(found[1:]).all()
+        scores = record["nees"].values[:, agent]
+        # Scores of the whole state need all of it.
+        assert np.isclose(scores[0], expected)
+        assert np.isnan(scores[1:]).all()
     total = record["total_squared_error"].values
-    assert np.allclose(total[0], squared[0].sum(axis=-1)) and np.isnan(total[1:]).all()
+    assert np.allclose(total[0], squared[0].sum(axis=-1))
+    assert np.isnan(total[1:]).all()
     # CRPS of a known component is that of a run in which all are known.
-    whole = run(truth=TRUTH)["crps"].values
+    complete = run(truth=TRUTH)["crps"].values
     is_known = ~np.isnan(squared)
-    assert np.array_equal(np.isnan(record["crps"].values), ~is_known)
-    assert np.allclose(record["crps"].values[is_known], whole[is_known])
+    crps = record["crps"].values
+    assert np.array_equal(np.isnan(crps), ~is_known)
+    assert np.allclose(crps[is_known], complete[is_known])
 
 
 def test_a_function_of_time_between_rare_truths() -> None:
@@ -90,6 +95,7 @@ def test_a_function_of_time_between_rare_truths() -> None:
     record = run(
         truth={"x": lambda t: np.interp(t, grid, path), "y": lambda t: [t, -t]}
     )
+    # At 1, 2.5 and 4 s between (0, 0), (2, 4) and (5, 1)
     x = np.array([2.0, 3.5, 2.0])
     error = record["squared_error"].values
     assert np.allclose(error[..., 0], (MEANS[:, 0] - x[:, None]) ** 2)
@@ -110,7 +116,8 @@ def test_nees_of_named_components_and_of_each_agents_own(family: str) -> None:
     for form, components in scored.items():
         if family == "gaussian":
             record = run(truth=TRUTH, scored=components)
-            means, covs = MEANS, COVS
+            means = MEANS
+            covs = COVS
         else:
             members = np.random.default_rng(0).standard_normal((2, 9, 3))
             f = filters.EnsembleFilter(
@@ -120,9 +127,10 @@ def test_nees_of_named_components_and_of_each_agents_own(family: str) -> None:
             record = f.run(start, TIMES, [None, None], truth=TRUTH, scored=components)
             means = members.mean(axis=1)
             covs = np.array([np.cov(x.T) for x in members])
-        for agent, own in enumerate(index[form]):
-            error = (means[agent] - TRUTH)[:, own]
-            inverse = np.linalg.inv(covs[agent][np.ix_(own, own)])
+        for agent, columns in enumerate(index[form]):
+            error = (means[agent] - TRUTH)[:, columns]
+            inverse = np.linalg.inv(covs[agent][np.ix_(columns, columns)])
+            # eᵀ P⁻¹ e at each time
             expected = np.einsum("ti,ij,tj->t", error, inverse, error)
             assert np.allclose(record["nees"].values[:, agent], expected)
             total = record["total_squared_error"].values[:, agent]
@@ -142,8 +150,8 @@ def test_a_failed_run_of_members_has_no_score_and_gaps_have_none() -> None:
     members = np.arange(4.0)[:, None] + np.array([0.0, 60.0])[:, None, None, None]
     start = f.start(members, rng=np.random.default_rng(0), runs=(2,))
     truth = np.array([1.0, np.nan, 2.0])
-    both = np.stack([truth, truth + 60.0], axis=1)[..., None]
-    record = f.run(start, TIMES, [None], truth=both)
+    by_run = np.stack([truth, truth + 60.0], axis=1)[..., None]
+    record = f.run(start, TIMES, [None], truth=by_run)
     # E|X - y| - E|X - X'| / 2 of four equal steps: 1 - 0.625 at both known truths
     expected = np.array([[0.375, 0.375], [np.nan, np.nan], [0.375, np.nan]])
     assert np.allclose(record["crps"].values[..., 0, 0], expected, equal_nan=True)
@@ -153,6 +161,7 @@ def test_a_failed_run_of_members_has_no_score_and_gaps_have_none() -> None:
 
 def test_scored_components_bridge_gaps_of_the_others() -> None:
     gaps = TRUTH.copy()
+    # The second component is never known, and is not scored.
     gaps[:, 1] = np.nan
     record = run(truth=gaps, scored=["x", "v"])
     expected = nees(1, MEANS[1][[0, 2]] - TRUTH[2, [0, 2]], [0, 2])
@@ -173,18 +182,20 @@ def test_what_is_kept_is_the_same_and_the_rest_is_not_there(lag: int) -> None:
     start = f.start(list(zip(MEANS, COVS, strict=True)))
     call = f.smooth if lag else f.run
     args = (start, TIMES, [TRUTH[:, :1], None])
-    whole = call(*args, truth=TRUTH)
+    complete = call(*args, truth=TRUTH)
     for keep in (["nees", "spread", "rejected"], ("bytes_total", "crps"), []):
         part = call(*args, truth=TRUTH, keep=keep)
         assert set(part.data_vars) == {"mean", *keep}
-        xarray.testing.assert_identical(
-            part, whole[["mean", *keep]][list(part.data_vars)]
-        )
+        names = list(part.data_vars)
+        xarray.testing.assert_identical(part, complete[["mean", *keep]][names])
+        # The last state is kept whatever the record has.
         last = f.final_state(part)
-        assert np.array_equal(last.joint_means, f.final_state(whole).joint_means)
+        expected = f.final_state(complete)
+        assert np.array_equal(last.joint_means, expected.joint_means)
     # Without a single time, the same variables.
     empty = f.run(start, [], [np.zeros((0, 1)), None], truth=TRUTH[:0], keep=["nees"])
-    assert set(empty.data_vars) == {"mean", "nees"} and empty["nees"].shape == (0, 2)
+    assert set(empty.data_vars) == {"mean", "nees"}
+    assert empty["nees"].shape == (0, 2)
 
 
 def test_a_long_run_without_covariances_holds_none() -> None:
@@ -193,9 +204,10 @@ def test_a_long_run_without_covariances_holds_none() -> None:
     f = filters.GaussianFilter(still, [None])
     start = f.start((np.zeros(20), np.eye(20)))
     times = np.arange(1.0, 301.0)
-    whole = f.run(start, times, [None])
+    complete = f.run(start, times, [None])
     part = f.run(start, times, [None], keep=["variance"])
-    assert whole.nbytes > 300 * 400 * 8
+    # 300 times, numbers of 8 bytes: 20² of a covariance; 20 + 20 of moments and a few more
+    assert complete.nbytes > 300 * 400 * 8
     assert part.nbytes < 300 * 45 * 8
 
 

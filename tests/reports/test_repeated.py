@@ -89,11 +89,11 @@ def test_the_same_observation_twice(family: str, copied: Any, way: str) -> None:
             return means(f, f.step(start, 1.0, [entries]))
         return np.asarray(f.run(start, None, entries)["mean"].values[-1])
 
-    expected = assimilate([one])
+    once = assimilate([one])
     with pytest.warns(RuntimeWarning, match=TWICE) as caught:
-        found = assimilate([one, copied(one)])
+        twice = assimilate([one, copied(one)])
     assert len(caught) == 1
-    assert (found == expected).all()
+    assert (twice == once).all()
 
 
 @EACH
@@ -101,9 +101,10 @@ def test_a_step_that_is_repeated_at_its_own_time(family: str) -> None:
     f = FAMILIES[family](WALK, [EYE])
     state = f.step(start_of(f), 1.0, [[0.3]])
     with pytest.warns(RuntimeWarning, match="sensor 0 at t = 1 s twice"):
-        again = f.step(state, 1.0, [np.array([0.3])])
+        repeated = f.step(state, 1.0, [np.array([0.3])])
+    # A second step to the same time, without an observation
     nothing = f.step(state, 1.0, [None])
-    assert (means(f, again) == means(f, nothing)).all()
+    assert (means(f, repeated) == means(f, nothing)).all()
 
 
 @pytest.mark.parametrize(
@@ -118,6 +119,7 @@ def test_a_delayed_copy(family: str, tmp_path: Any) -> None:
     value[0] = 9.0  # the user's array may be used again
     state.save(tmp_path / "state.npz")
     state = type(state).load(tmp_path / "state.npz")
+    # The copy of an observation that the state has had changes nothing.
     plain = f.step(state, 2.0, [[0.5]])
     with pytest.warns(RuntimeWarning, match=TWICE):
         state = f.step(state, 2.0, [[0.5]], delayed=[one])
@@ -125,6 +127,7 @@ def test_a_delayed_copy(family: str, tmp_path: Any) -> None:
     # The warning is given once in a chain of states.
     with warnings.catch_warnings(action="error"):
         state = f.step(state, 2.5, [None], delayed=[one])
+    # One that comes late twice: in one step, and in two
     other = Observation(2.0, 0, [0.7])
     start = f.step(start_of(f), 2.0, [None])
     once = f.step(start, 3.0, [None], delayed=[other])
@@ -143,6 +146,7 @@ def test_a_network_that_delivers_twice() -> None:
     events = [Observation(float(t), t % 2, [0.1 * t]) for t in range(1, 6)]
     times = np.arange(1.0, 6.0)
     expected = f.run(start_of(f), times, events)
+    # Copies of the first three come two steps later, and one event is in the list twice.
     late = [o.replace(arrival_time=o.t + 1.5) for o in events[:3]]
     with pytest.warns(RuntimeWarning, match=TWICE):
         run = f.run(start_of(f), times, [*events, events[1]], delayed=late)
@@ -155,8 +159,8 @@ def test_increments_of_what_came_twice() -> None:
     one = Observation(1.0, 0, [0.3])
     expected = means(f, f.step(start_of(f), 1.0, [one, None]))
     with pytest.warns(RuntimeWarning, match=TWICE):
-        found = means(f, f.step(start_of(f), 1.0, [[one, one], None]))
-    assert (found == expected).all()
+        twice = means(f, f.step(start_of(f), 1.0, [[one, one], None]))
+    assert (twice == expected).all()
 
 
 def test_two_that_differ_count_both() -> None:
@@ -172,11 +176,13 @@ def test_two_that_differ_count_both() -> None:
     ]
     with warnings.catch_warnings(action="error"):
         for pair in pairs:
-            one = f.step(start_of(f), 1.0, [[pair[0]], None]).covariances[0]
-            both = f.step(start_of(f), 1.0, [list(pair), None]).covariances[0]
-            assert np.trace(both) < np.trace(one)
+            of_one = f.step(start_of(f), 1.0, [[pair[0]], None]).covariances[0]
+            of_two = f.step(start_of(f), 1.0, [list(pair), None]).covariances[0]
+            assert np.trace(of_two) < np.trace(of_one)
+        # The same value of another agent, and of another time
         state = f.step(start_of(f), 1.0, [pairs[0][0], [0.3]])
         f.step(state, 2.0, [Observation(2.0, 0, [0.3]), [0.3]])
+    # Two sensors that are made alike are one sensor.
     sensor = distance([0], std=0.5, origin=[-1.0])
     twin = distance([0], std=0.5, origin=[-1.0])
     entries = [Observation(1.0, 0, [0.5], s) for s in (sensor, twin)]
@@ -210,6 +216,7 @@ LIKELIHOODS = [
 def test_likelihoods_in_place_of_logarithms(call: Any, values: list[float]) -> None:
     with pytest.warns(RuntimeWarning, match="log_weights must be logarithms"):
         call(np.array(values))
+    # Also where they no longer sum to exactly one
     with pytest.warns(RuntimeWarning, match="log_weights must be logarithms"):
         call(np.array(values) * (1 - 1e-6))
 
@@ -243,7 +250,7 @@ ANGLES = {
         stack([component([0], std=0.5), bearing([0, 1], std=0.05)]),
         [1.0, -120.0],
     ),
-    "own": (
+    "user's": (
         Sensor(
             1,
             lambda x: np.arctan2(x[..., 1:], x[..., :1]),
@@ -289,10 +296,9 @@ def test_degrees_in_every_way(kind: str, n_sensors: int) -> None:
             warnings.simplefilter("always")
             call()
         texts = [str(w.message) for w in caught]
-        assert sum(text.startswith("observations[0] must be") for text in texts) == 1, (
-            name,
-            texts,
-        )
+        about_angles = [t for t in texts if t.startswith("observations[0] must be")]
+        # One warning, whatever way the observation came
+        assert len(about_angles) == 1, (name, texts)
 
 
 def test_angles_that_are_right_are_not_doubted() -> None:
@@ -304,8 +310,9 @@ def test_angles_that_are_right_are_not_doubted() -> None:
         residual_function=lambda a, b: (a - b + 180) % 360 - 180,
     )
     declared = compass.replace(residual_function=None, periods=(360.0,))
-    far = range_bearing([0, 1], std=[0.5, 0.05])
-    cases = [(compass, [280.0]), (declared, [280.0]), (far, [900.0, -3.0])]
+    radar = range_bearing([0, 1], std=[0.5, 0.05])
+    # A range may be 900 m, and a bearing a little more than a turn.
+    cases = [(compass, [280.0]), (declared, [280.0]), (radar, [900.0, -3.0])]
     cases.append((bearing([0, 1], std=0.1), [6.5]))
     for sensor, value in cases:
         f = GaussianFilter(STILL, [sensor])
@@ -339,6 +346,7 @@ def test_a_clock_is_noticed_before_the_prior_is_lost(family: str) -> None:
             try:
                 call()
             except Exception as error:
+                # An error that follows must print the time with all its digits.
                 assert "1.7e+09" not in str(error)
         assert [CLOCK in str(w.message) for w in caught].count(True) == 1
     with warnings.catch_warnings(action="error"):
@@ -347,6 +355,7 @@ def test_a_clock_is_noticed_before_the_prior_is_lost(family: str) -> None:
 
 def test_seconds_of_a_week_beside_short_steps() -> None:
     f = GaussianFilter(WALK, [EYE])
+    # Four days after the beginning of a week, as receivers count
     times = 345_600 + 0.1 * np.arange(5)
     with pytest.warns(RuntimeWarning, match="got 345600 first"):
         f.run(start_of(f), times, [np.zeros((5, 1))])

@@ -65,19 +65,21 @@ def joint(
             return cross(s, r).T
         return (drift(r) @ p0 @ drift(r).T + spread(r)) @ drift(s - r).T
 
-    times = [event[0] for event in observed]
-    rows = [event[1] for event in observed]
-    mean_y = np.array([(drift(s) @ m0)[k] for s, k in zip(times, rows, strict=True)])
-    cov_y = np.array(
-        [
-            [cross(r, s)[j, k] for s, k in zip(times, rows, strict=True)]
-            for r, j in zip(times, rows, strict=True)
-        ]
-    )
-    cov_y += np.diag([(0.16, 0.09)[k] for k in rows])
-    cov_xy = np.array([cross(t, s)[:, k] for s, k in zip(times, rows, strict=True)]).T
+    n = len(observed)
+    y = np.empty(n)
+    mean_y = np.empty(n)
+    cov_y = np.empty((n, n))
+    cov_xy = np.empty((2, n))
+    for a, (s, k, value) in enumerate(observed):
+        y[a] = value
+        mean_y[a] = (drift(s) @ m0)[k]
+        cov_xy[:, a] = cross(t, s)[:, k]
+        for b, (r, j, _) in enumerate(observed):
+            cov_y[a, b] = cross(s, r)[k, j]
+        # The noise of a place or of a speed
+        cov_y[a, a] += (0.16, 0.09)[k]
+    # E[x | y] = E x + C_xy C_yy⁻¹ (y - E y)
     gain = np.linalg.solve(cov_y, cov_xy.T).T
-    y = np.array([event[2] for event in observed])
     mean = drift(t) @ m0 + gain @ (y - mean_y)
     return mean, cross(t, t) - gain @ cov_xy.T
 
@@ -96,10 +98,13 @@ ON_TIME = [(t, 0, y) for t, y in zip(TIMES.tolist(), SERIES, strict=True)]
 
 def check(state: Any, f: Any, events: list[Any], tolerance: float) -> None:
     mean, cov = joint(events, state.t)
+    # Errors are in units of the right standard deviations.
     std = np.sqrt(np.diag(cov))
     summary = f.summarize(state)
-    assert np.abs((summary.mean[0] - mean) / std).max() < tolerance
-    assert np.abs(np.sqrt(summary.variance[0]) / std - 1).max() < tolerance
+    mean_error = (summary.mean[0] - mean) / std
+    std_error = np.sqrt(summary.variance[0]) / std - 1
+    assert np.abs(mean_error).max() < tolerance
+    assert np.abs(std_error).max() < tolerance
 
 
 # Late measurements.
@@ -115,6 +120,7 @@ def test_one_of_three_seconds_ago_and_then_one_of_two(family: str) -> None:
         state = f.step(state, t, [[Observation(t, 0, [y])]])
     for t, y in ((2.0, 1.4), (2.5, 0.6), (3.0, 1.1)):
         state = f.step(state, 5.0, [None], delayed=[Observation(t, 0, [y], 1)])
+    # The one of 2.5 s is of no step's time.
     late = [(2.0, 1, 1.4), (2.5, 1, 0.6), (3.0, 1, 1.1)]
     check(state, f, [*ON_TIME, *late], tolerance)
 
@@ -272,12 +278,10 @@ def test_evidence_where_particles_resample_now_and_then(threshold: float) -> Non
     )
     start = f.start(PRIOR, rng=np.random.default_rng(5))
     run = f.run(start, TIMES, [np.array(SERIES)[:, None]])
+    # log p(y₁, …, y₅) = Σ log p(y_k | y₁, …, y_{k-1}); without observations `joint` is the prior.
     expected = 0.0
     for k, (t, _, y) in enumerate(ON_TIME):
-        before = ON_TIME[:k]
-        mean, cov = joint(before, t) if before else (drift(t) @ PRIOR[0], None)
-        if cov is None:
-            cov = drift(t) @ PRIOR[1] @ drift(t).T + spread(t)
+        mean, cov = joint(ON_TIME[:k], t)
         expected += norm.logpdf(y, mean[0], np.sqrt(cov[0, 0] + 0.16))
     assert abs(float(run["log_likelihood"].sum()) - expected) < 0.05
     # Each way of resampling occurs: never, at some steps, at all of them.
@@ -290,11 +294,12 @@ def test_evidence_where_particles_resample_now_and_then(threshold: float) -> Non
 def test_missing_numbers_are_no_evidence(linearization: Any) -> None:
     """forecast pull 1121 and pymc-extras pull 682: rows and columns of R are left out."""
     noise = np.array([[0.5, 0.3], [0.3, 0.4]])
-    both = Sensor(2, lambda x: 2.0 * x + 1.0, noise)
+    pair = Sensor(2, lambda x: 2.0 * x + 1.0, noise)
     f = filters.GaussianFilter(
-        MOTION, [both], record_evidence=True, linearization=linearization
+        MOTION, [pair], record_evidence=True, linearization=linearization
     )
     start = f.start(PRIOR, t=1.0)
+    # Mean and covariance of y = 2 x + 1 + noise
     mean = 2 * PRIOR[0] + 1
     cov = 4 * PRIOR[1] + noise
     value = np.array([0.4, 2.0])
@@ -302,16 +307,17 @@ def test_missing_numbers_are_no_evidence(linearization: Any) -> None:
         y = value.copy()
         y[missing] = np.nan
         state = f.step(start, 1.0, [y])
-        kept = np.flatnonzero(~np.isnan(y))
-        assert state.n_observed.tolist() == [len(kept)]
-        if not len(kept):
+        present = np.flatnonzero(~np.isnan(y))
+        assert state.n_observed.tolist() == [len(present)]
+        if not len(present):
             assert state.log_likelihood.tolist() == [0.0]
             assert state.nis.tolist() == [0.0]
             continue
-        block = cov[np.ix_(kept, kept)]
-        law = multivariate_normal(mean[kept], block)
-        assert np.isclose(state.log_likelihood[0], law.logpdf(y[kept]))
-        r = y[kept] - mean[kept]
+        # The marginal density of the present components
+        block = cov[np.ix_(present, present)]
+        law = multivariate_normal(mean[present], block)
+        assert np.isclose(state.log_likelihood[0], law.logpdf(y[present]))
+        r = y[present] - mean[present]
         assert np.isclose(state.nis[0], r @ np.linalg.solve(block, r))
 
 
@@ -330,8 +336,10 @@ def test_a_velocity_that_is_reset_has_no_share_in_the_position(family: str) -> N
     state = f.reset(state, [1], [-2.0], [[0.04]])
     m = np.array([before_mean[0], -2.0])
     p = np.diag([before_cov[0, 0], 0.04])
-    # The next step and observation.
-    m, p = drift(0.5) @ m, drift(0.5) @ p @ drift(0.5).T + spread(0.5)
+    # The next step, F m and F P Fᵀ + Q, and the observation of its position
+    f_half = drift(0.5)
+    m = f_half @ m
+    p = f_half @ p @ f_half.T + spread(0.5)
     gain = p[:, 0] / (p[0, 0] + 0.16)
     m = m + gain * (3.9 - m[0])
     p = p - np.outer(gain, p[0])
@@ -351,6 +359,7 @@ def test_an_observation_of_before_a_reset_does_not_undo_it(family: str) -> None:
         state = f.step(state, t, [[y]])
     state = f.reset(state, [1], [-2.0], [[0.04]])
     state = f.step(state, 5.0, [None], delayed=[Observation(3.5, 0, [2.0])])
+    # The position of all observations without a reset, and the velocity of the reset
     mean, cov = joint([*ON_TIME, (3.5, 0, 2.0)], 5.0)
     after = f.summarize(state)
     std = np.sqrt([cov[0, 0], 0.04])

@@ -64,7 +64,9 @@ def test_a_density_filter_starts_with_the_prior_of_its_options(
     plain = DensityFilter(
         model, 3, 2.0, fusion=density.Flooding(), bandwidth=0.2, rank=9
     )
-    assert not np.allclose(plain.start(np.full((3, 2), 0.5)).variances, state.variances)
+    # Without the option they are others.
+    by_default = plain.start(np.full((3, 2), 0.5)).variances
+    assert not np.allclose(by_default, state.variances)
 
 
 def test_a_density_filter_starts_with_gaussians_of_its_width() -> None:
@@ -87,6 +89,7 @@ def test_transport_with_correction_has_the_weighted_covariance() -> None:
     x = np.random.default_rng(0).standard_normal((30, 2))
     logs = -0.5 * ((x[:, 0] - 0.7) / 0.5) ** 2
     w = np.exp(logs) / np.exp(logs).sum()
+    # Σ w (x - x̄)(x - x̄)ᵀ of the members before the transport
     centred = x - w @ x
     weighted = (w[:, None] * centred).T @ centred
     close = []
@@ -102,16 +105,16 @@ def test_transport_with_correction_has_the_weighted_covariance() -> None:
 
 def test_stacked_residuals_are_cut_where_their_sensors_end() -> None:
     """Of [bearing, two components, bearing] the first and the last number wrap alone."""
-    both = stack(
+    sensor = stack(
         [
             bearing([0, 1], std=0.1),
             component([0, 1], std=0.1),
             bearing([0, 1], std=0.1),
         ]
     )
-    residual = both.residual(
-        np.array([3.0, 9.0, -9.0, -3.0]), np.array([-3.0, 1.0, 1.0, 3.0])
-    )
+    observed = np.array([3.0, 9.0, -9.0, -3.0])
+    predicted = np.array([-3.0, 1.0, 1.0, 3.0])
+    residual = sensor.residual(observed, predicted)
     turn = 2 * np.pi
     assert np.allclose(residual, [6 - turn, 8.0, -10.0, turn - 6])
 
@@ -126,12 +129,13 @@ def test_the_safeguard_of_a_projection_looks_at_the_quantity_that_it_moves(
     for seed in range(300):
         x = np.random.default_rng(seed).normal(0.7, 0.6, (3, 1))
         free = coupling.project(x, square, variant=variant, safeguard=False)
-        before, after = x**2 - 1, free**2 - 1
+        before = x**2 - 1
+        after = free**2 - 1
         by_mean = abs(after.mean()) <= abs(before.mean())
         by_members = np.abs(after).sum() <= np.abs(before).sum()
         accepts = by_mean if variant == "shift" else by_members
-        kept = coupling.project(x, square, variant=variant)
-        assert np.allclose(kept, free if accepts else x)
+        guarded = coupling.project(x, square, variant=variant)
+        assert np.allclose(guarded, free if accepts else x)
         verdicts.add((bool(by_mean), bool(by_members)))
     # Both disagreements occur.
     assert {(True, False), (False, True)} <= verdicts
@@ -171,9 +175,8 @@ def test_localisation_is_by_the_distance() -> None:
         observation_places=[[0.0, 0.0]],
         radius=4.0,
     )
-    whole, tapered = (
-        update(*arguments, rng=np.random.default_rng(7)) - x for update in (enkf, local)
-    )
+    untapered = enkf(*arguments, rng=np.random.default_rng(7)) - x
+    tapered = local(*arguments, rng=np.random.default_rng(7)) - x
     # Gaspari and Cohn at r = 5/4, from their equation (4.10).
     r = 1.25
     rho = r**5 / 12 - r**4 / 2 + 5 * r**3 / 8 + 5 * r**2 / 3 - 5 * r + 4 - 2 / (3 * r)
@@ -182,7 +185,7 @@ def test_localisation_is_by_the_distance() -> None:
     moments = np.cov(x.T)
     ratio = moments[0, 1] / moments[0, 0]
     assert np.allclose(tapered[:, 1], rho * ratio * tapered[:, 0], atol=1e-12)
-    assert np.allclose(whole[:, 1], ratio * whole[:, 0], atol=1e-12)
+    assert np.allclose(untapered[:, 1], ratio * untapered[:, 0], atol=1e-12)
 
 
 def test_the_first_threshold_of_events_is_the_threshold() -> None:
@@ -217,6 +220,7 @@ def test_the_ends_of_the_trapezoid_rule_count_half(d: int) -> None:
     logs = [log - np.log(mass) for log, mass in zip(logs, masses, strict=True)]
     p, q = (np.exp(log) for log in logs)
     log_ratio = logs[0] - logs[1]
+    # ½ ∫ (p - q) log(p / q) dx
     expected = 0.5 * integrate((p - q) * log_ratio)
     functions = [partial(np.dot, b=slope) for slope in slopes]
     (result,) = jeffreys_of_many(

@@ -24,7 +24,7 @@ from distfilt.mixtures import GaussianMixture
 from distfilt.models import Model
 from distfilt.network import graphs
 from distfilt.sensors import Sensor, component, wrap
-from distfilt.updates import etkf, with_localization
+from distfilt.updates import etkf, update, with_localization
 from distfilt.updates.wrappers import gaspari_cohn
 from tests.filters.families import still_model
 
@@ -141,6 +141,44 @@ def test_the_taper_between_correlated_observations_is_theirs() -> None:
         joint = joint + moves[:, None] * c
     after = local(x, h, y, noise, rng=rng)
     assert np.allclose(after, joint[:, :2], rtol=0, atol=1e-10)
+
+
+def test_a_change_that_is_no_gain_is_tapered_by_squared_weights() -> None:
+    """An update that moves all members alike: by Σ_j w_j² ρ_kj / Σ_j w_j² for each mixture w.
+
+    A mixture Σ_j w_j y_j has the shares w_j² of its variance from its parts, whose noise is alike.
+    """
+    places = np.array([[0.0], [2.5]])
+    seen_at = np.array([[1.0], [4.0]])
+    x = np.random.default_rng(0).standard_normal((12, 2))
+    noise = np.array([[0.5, 0.3], [0.3, 0.8]])
+
+    def move_first_two(
+        ensemble: np.ndarray,
+        predicted: np.ndarray,
+        observed: np.ndarray,
+        noise: np.ndarray,
+        *,
+        rng: np.random.Generator,
+    ) -> np.ndarray:
+        # Behind the state stand the predictions, which stay.
+        change = np.zeros(ensemble.shape[-1])
+        change[:2] = [1.0, -3.0]
+        return ensemble + change
+
+    local = with_localization(
+        update(move_first_two),
+        places=places,
+        observation_places=seen_at,
+        radius=2.0,
+    )
+    after = local(x, x, [0.3, -0.4], noise, rng=np.random.default_rng(0))
+    rho = gaspari_cohn(np.abs(places - seen_at.T) / 2.0)
+    # Two mixtures, the rows of W with W R Wᵀ = I
+    squares = np.linalg.inv(np.linalg.cholesky(noise)) ** 2
+    shares = squares @ rho.T / squares.sum(axis=1, keepdims=True)
+    expected = shares.sum(axis=0) * [1.0, -3.0]
+    assert np.allclose(after - x, expected, rtol=0, atol=1e-12)
 
 
 def test_the_gate_of_a_sum_of_one_component_is_that_of_a_gaussian() -> None:

@@ -95,10 +95,10 @@ def test_distances_and_bearings_by_their_definition() -> None:
     """The distance is a hypotenuse and the bearing an arctan2; a radar measures both."""
     offset = X[:, [2, 0]] - PLACE
     lengths = distance([2, 0], std=0.1, origin=PLACE).predict(X)
-    assert np.allclose(lengths[:, 0], np.hypot(*offset.T), rtol=1e-15)
+    assert np.allclose(lengths[:, 0], np.hypot(*offset.T), rtol=1e-15, atol=0)
     angles = bearing([2, 0], std=0.1, origin=PLACE).predict(X)
     expected = np.arctan2(offset[:, 1], offset[:, 0])
-    assert np.allclose(angles[:, 0], expected, rtol=1e-15)
+    assert np.allclose(angles[:, 0], expected, rtol=1e-15, atol=0)
     place = np.array(PLACE)
     radar = range_bearing([2, 0], std=[0.3, 0.1], origin=place)
     # A caller who goes on with the array does not move the sensor.
@@ -117,7 +117,7 @@ def test_a_sensor_by_its_name(maker: Callable[..., Sensor]) -> None:
     named = sensors.from_name(maker.__name__, [2, 0], std=0.3)
     made = maker([2, 0], std=0.3)
     assert named.kind == made.kind == maker.__name__
-    assert np.allclose(named.noise_cov, 0.09 * np.eye(made.dim), rtol=1e-15)
+    assert np.allclose(named.noise_cov, 0.09 * np.eye(made.dim), rtol=1e-15, atol=0)
     # A residual of 4 tells periods π, 2π and none apart.
     observed = np.full(named.dim, 2.0)
     residual = made.residual(observed, -observed)

@@ -64,6 +64,23 @@ def test_averaged_moments_give_the_map_of_all_samples(
         assert error < 1e-12 * scale
 
 
+def test_agents_whose_samples_differ_from_each_other_only() -> None:
+    """An observation that is one number for each agent, and other numbers for the others.
+
+    Deviations are those about the common mean; about an agent's own they would be zero.
+    """
+    y, x = _samples(5, agents=4, m=1, d=2)
+    y[...] = np.array([-1.0, 0.5, 2.0, 4.0])[:, None, None]
+    central = _fit_all(y, x)
+    channel = Channel(graphs.complete(4))
+    pooled, _ = pool_by_admm(y, x, channel, tolerance=1e-9)
+    for name in _FIELDS:
+        assert np.allclose(getattr(pooled, name), getattr(central, name), atol=1e-6)
+    by_moments = pool_by_moments(y, x, Channel(graphs.complete(4)))
+    for name in _FIELDS:
+        assert np.allclose(getattr(by_moments, name), getattr(central, name))
+
+
 def test_averaged_moments_in_several_runs_and_their_cost() -> None:
     """On a complete graph one round each: D + D (D + 1) / 2 = 12 + 78 scalars on every link."""
     first = _samples(1, m=6, d=6)

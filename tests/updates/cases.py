@@ -50,6 +50,8 @@ UPDATES = {
     "with_projection": updates.with_projection(updates.enkf, PLANE),
     "with_retraction": updates.with_retraction(updates.enkf, PLANE),
 }
+CONSTRAINED = ("with_augmentation", "with_projection", "with_retraction")
+"""Updates that bring members near the plane, which has units and an origin of its own."""
 
 
 def rng(seed: int = 1) -> np.random.Generator:

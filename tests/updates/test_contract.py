@@ -7,7 +7,7 @@ import pytest
 
 from tests.support import without_checks
 
-from .cases import UPDATES, H, R, Y, members, rng
+from .cases import CONSTRAINED, UPDATES, H, R, Y, members, rng
 
 EACH_UPDATE = pytest.mark.parametrize("name", UPDATES)
 
@@ -49,3 +49,31 @@ def test_a_noise_covariance_for_each_ensemble(name: str) -> None:
         # The other ensemble has another covariance, which matters.
         difference = analysis[1 - k] - uniform[1 - k]
         assert np.abs(difference).max() > 0.2
+
+
+@EACH_UPDATE
+def test_the_units_and_the_origin_of_observations_change_nothing(name: str) -> None:
+    """Of z = D y + b the noise is D R D; the draws are those of y, as D is diagonal."""
+    update = UPDATES[name]
+    x = members(30)
+    predicted = x @ H.T
+    unit = np.array([1e3, 0.02])
+    origin = np.array([-5.0, 8.0])
+    expected = update(x, predicted, Y, R, rng=rng(5))
+    noise = unit[:, None] * R * unit
+    analysis = update(
+        x, unit * predicted + origin, unit * Y + origin, noise, rng=rng(5)
+    )
+    assert np.allclose(analysis, expected, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", [n for n in UPDATES if n not in CONSTRAINED])
+def test_the_unit_and_the_origin_of_states_change_nothing(name: str) -> None:
+    """z = 20 x + b, with the same predictions, has the analysis 20 x⁺ + b."""
+    update = UPDATES[name]
+    x = members(30)
+    predicted = x @ H.T
+    origin = np.array([7.0, -3.0, 40.0])
+    expected = update(x, predicted, Y, R, rng=rng(5))
+    analysis = update(20 * x + origin, predicted, Y, R, rng=rng(5))
+    assert np.allclose(analysis, 20 * expected + origin, rtol=0, atol=1e-7)
