@@ -5,7 +5,7 @@ A trial is a function of one seed. `run` calls it for every seed, on this machin
 soon as it is done, and continues where it was stopped; `check` compares a later run with it.
 """
 
-from .checking import check, script
+from .checking import check, example, script
 from .files import Stored, fingerprint, load, merge, store, stored
 from .running import Failure, Study, StudyError, run, spawn
 
@@ -15,6 +15,7 @@ __all__ = [
     "Study",
     "StudyError",
     "check",
+    "example",
     "fingerprint",
     "load",
     "merge",

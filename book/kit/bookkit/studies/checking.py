@@ -15,7 +15,7 @@ from ..folders import data_root, inside
 from .files import Stored, fingerprint, load
 from .running import Study, Trial, pickle_by_value, plain, row, run, versions
 
-__all__ = ["check", "script"]
+__all__ = ["check", "example", "script"]
 
 
 def script(name: str, *, folder: Path | None = None) -> ModuleType:
@@ -50,6 +50,23 @@ def script(name: str, *, folder: Path | None = None) -> ModuleType:
     sys.modules[spec.name] = sys.modules.pop(spec.name)
     pickle_by_value(path.parent)
     return module
+
+
+def example(name: str) -> ModuleType:
+    """Return the module of a program of ``book/examples``, beside the data, without running it.
+
+    Parameters
+    ----------
+    name : str
+        The program's name, such as ``radios``. What it does stands below its test of
+        ``__name__``, and is left out.
+
+    Examples
+    --------
+    >>> example("radios").RANGE_STD > 0
+    True
+    """
+    return script(name, folder=data_root().parent / "book" / "examples")
 
 
 def check(
