@@ -135,7 +135,8 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
         else:
             total = self._total(step, branch, covs, own)
             new = self._solve(step, branch, covs, total)
-        return self._end(step, *new)
+        means, covs = new
+        return self._end(step, means, symmetrise(covs))
 
     @property
     def _omega(self) -> float:

@@ -182,36 +182,43 @@ class GaussianFamily(
         RuntimeWarning
             If a standard deviation after the fusion is below the rounding of its mean.
         """
-        means, covs = self._assimilate(step)
+        means, covs = self._check_forecast(step)
+        # Joseph's form leaves symmetric covariances, a forecast does so up to rounding.
+        is_symmetric = False
+        for place, group in step.received():
+            means, covs = self._condition(means, covs, place, group, step)
+            is_symmetric = is_symmetric or len(group.agents) == self.n_agents
+        # A run that failed here needs a covariance with a Cholesky factor in the fusion.
+        covs = step.keep_failed(covs, identity(means.shape[-1]))
         if step.has_fusion:
             means, covs = self._fuse(means, covs, step)
+            is_symmetric = False
+        if not is_symmetric or step.any_failed:
+            covs = symmetrise(covs)
         return self._end(step, means, covs)
-
-    def _assimilate(self, step: Step[GaussianState]) -> tuple[Array, Array]:
-        """Return the joint moments after the forecast and the received observations."""
-        means, covs = self._check_forecast(step)
-        for place, group in step.received():
-            self._condition(means, covs, place, group, step)
-        # A run that failed here needs a covariance with a Cholesky factor in the fusion.
-        return means, step.keep_failed(covs, identity(means.shape[-1]))
 
     def _check_forecast(self, step: Step[GaussianState]) -> tuple[Array, Array]:
         """Return the forecast's joint moments; failed runs get a harmless Gaussian."""
         means, covs = self._forecast(step)
+        if all_finite(means) and all_finite(covs) and not step.any_failed:
+            return means, covs
         means = step.check_forecast(means, 0.0)
         return means, step.check_forecast(covs, identity(means.shape[-1]))
 
     def _end(
         self, step: Step[GaussianState], means: Array, covs: Array, **fields: Array
     ) -> GaussianState:
-        """Return the state after the step with these joint moments, and a family's own fields."""
+        """Return the state after the step with these joint moments, and a family's own fields.
+
+        The covariances are symmetric to the last digit.
+        """
         if self.periods:
             # The mean of each time by itself: a covariance does not depend on the branch.
             n_times = means.shape[-1] // self.model.dim
             means = wrap_differences(means, self.periods * n_times)
         return step.end(
             joint_means=means,
-            joint_covariances=symmetrise(covs),
+            joint_covariances=covs,
             dim=step.state.dim,
             history=step.times[::-1],
             **fields,
@@ -329,17 +336,21 @@ class GaussianFamily(
         place: int,
         group: Received,
         step: Step[GaussianState],
-    ) -> None:
-        """Condition a group's joint Gaussians on its observations, in place."""
+    ) -> tuple[Array, Array]:
+        """Return all joint moments with a group's conditioned on its observations."""
         d = self.model.dim
         rows = group.rows
-        # The latest time comes first in the joint state, and last among the places.
-        first = (len(step.times) - place) * d
-        block = slice(first, first + d)
-        joint_mean = means[..., rows, :]
-        joint_cov = covs[..., rows, :, :]
-        mean = joint_mean[..., block]
-        cov = joint_cov[..., block, block]
+        is_part = len(group.agents) < means.shape[-2]
+        joint_mean = means[..., rows, :] if is_part else means
+        joint_cov = covs[..., rows, :, :] if is_part else covs
+        mean = joint_mean
+        cov = joint_cov
+        if mean.shape[-1] > d:
+            # The latest time comes first in the joint state, and last among the places.
+            first = (len(step.times) - place) * d
+            block = slice(first, first + d)
+            mean = joint_mean[..., block]
+            cov = joint_cov[..., block, block]
         group, predicted, slope, extra = self._predict(mean, cov, group, step)
         # r = y* - h(m); NaN where a component is missing, which `condition` leaves out.
         innovation = group.target - predicted
@@ -356,13 +367,21 @@ class GaussianFamily(
         if extra is not None:
             # S = H P Hᵀ + R, where the extra covariance of the unscented points counts as noise.
             arrays = (*arrays, group.noise + extra)
-        means[..., rows, :], covs[..., rows, :, :] = step.apply(
+        new_mean, new_cov = step.apply(
             _condition_rows,
             arrays,
             (joint_mean, joint_cov),
             group.agents,
             shared=group.noise,
         )
+        if not is_part:
+            return new_mean, new_cov
+        # Copies: the forecast's mean may be an array that the model keeps.
+        means = means.copy()
+        covs = covs.copy()
+        means[..., rows, :] = new_mean
+        covs[..., rows, :, :] = new_cov
+        return means, covs
 
     def _relinearize(
         self,
@@ -419,12 +438,16 @@ class GaussianFamily(
             if not (is_steep and all_finite(steepness) and all_finite(predicted)):
                 predicted = self._leave_out_unseen(predicted, slope, group, step)
 
-        def moments(_: Array) -> tuple[Array, Array]:
-            """Return the moments of the prediction, which lie on one branch."""
-            predicted_cov = slope @ cov @ slope.mT
-            return predicted, predicted_cov if extra is None else predicted_cov + extra
+        if step.tests_innovations:
 
-        group = step.gate(group, moments, predicted[..., None, :])
+            def moments(_: Array) -> tuple[Array, Array]:
+                """Return the moments of the prediction, which lie on one branch."""
+                predicted_cov = slope @ cov @ slope.mT
+                if extra is not None:
+                    predicted_cov = predicted_cov + extra
+                return predicted, predicted_cov
+
+            group = step.gate(group, moments, predicted[..., None, :])
         return group, predicted, slope, extra
 
     def _leave_out_unseen(

@@ -11,7 +11,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from types import EllipsisType
 from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, cast
 
@@ -23,7 +23,7 @@ from ..linalg import cholesky, deviations, log_det, quadratic_form
 from ..models import Model
 from ..periods import check_sensor, gather
 from ..sensors import LikelihoodSensor, Sensor
-from ..validation import Array, Indices, Mask, call_user, format_number
+from ..validation import Array, Indices, Mask, all_finite, call_user, format_number
 from ..validation.batching import name_of_check
 from ..validation.first_use import needs_check
 from . import failures
@@ -172,16 +172,21 @@ class Step(Generic[S]):
             for name in ("log_likelihood", "nis", "n_observed"):
                 self.scores[name] = np.zeros((*self.runs, filter_.n_agents))
 
-    @cached_property
+    @property
     def model(self) -> Model:
         """The model of the agents' states, (*runs, A, ..., d)."""
         return self.filter.model_of_states(self.runs)
+
+    @property
+    def tests_innovations(self) -> bool:
+        """Whether there is a gate, or scores of the observations."""
+        return self.rejected is not None or bool(self.scores)
 
     # The beliefs -----------------------------------------------------------------------
 
     def check_forecast(self, values: Array, old: Array | float) -> Array:
         """Return a finite forecast (*runs, A, ...), and `old` in failed runs."""
-        if np.count_nonzero(np.isfinite(values)) < values.size:
+        if not all_finite(values):
             # One row for each run and agent.
             lead = len(self.runs) + 1
             errors = failures.find_nonfinite_rows(values, lead, "forecast")
@@ -417,9 +422,8 @@ class Step(Generic[S]):
         """
         lead = len(self.runs) + (agents is not None)
         # The state of the generator, to draw the same numbers in a second attempt.
-        is_batch = math.prod(arrays[0].shape[:lead]) > 1
         rng_state: Mapping[str, object] | None = None
-        if rng is not None and is_batch:
+        if rng is not None and math.prod(arrays[0].shape[:lead]) > 1:
             rng_state = rng.bit_generator.state
         errors: dict[Row, str] = {}
         # The plain way: one call for the whole batch.
@@ -438,7 +442,7 @@ class Step(Generic[S]):
             )
         # A row may also fail without an error, by overflow for instance.
         for values in results:
-            if np.count_nonzero(np.isfinite(values)) < values.size:
+            if not all_finite(values):
                 errors |= failures.find_nonfinite_rows(values, lead, "result")
         if errors:
             # Failed rows keep their values from before the computation.
@@ -892,7 +896,7 @@ class Received:
                 values = self._predict_part(part, of_agents, before, branch)
                 rows[(..., *part.cells, slice(None))] = values.swapaxes(-1, -2)
             result = np.ascontiguousarray(rows.swapaxes(-1, -2))
-        if np.count_nonzero(np.isinf(result)):
+        if not all_finite(result) and np.isinf(result).any():
             raise ValueError(
                 "predicted must have finite numbers or NaN (missing), got infinity"
             )
