@@ -198,15 +198,17 @@ def find_degrees(
             if sensor >= len(sensors):
                 continue
             sensor = sensors[sensor]
-        # Angles below four turns need no closer look.
-        value = np.asarray(observation.value, dtype=np.float64)
-        is_large = sensor.wraps and np.nan_to_num(np.abs(value)).max(initial=0.0) > 25
-        if is_large and value.shape[-1:] == (sensor.dim,):
+        if not sensor.wraps:
+            continue
+        value = observation.value
+        if value.shape[-1:] == (sensor.dim,):
             values.setdefault((observation.agent, sensor), []).append(value)
     for (agent, sensor), parts in values.items():
         observed = np.concatenate([v.reshape(-1, sensor.dim) for v in parts])
         observed = np.nan_to_num(observed)
-        turns = _count_turns(sensor, observed)
+        # Angles below four turns need no closer look.
+        large = observed[(np.abs(observed) > 25).any(axis=-1)]
+        turns = _count_turns(sensor, large) if large.size else 0.0
         if turns > 4:
             return (
                 f"observations[{agent}] must be angles in rad, got some {turns:.0f} turns off "

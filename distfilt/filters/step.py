@@ -144,7 +144,7 @@ class Step(Generic[S]):
             self.rng = copy_rng(state.rng)
         self.failed: Mask = getattr(state, "failed", _NO_RUNS)
         self.runs: tuple[int, ...] = self.failed.shape
-        self.any_failed = bool(np.count_nonzero(self.failed))
+        self.any_failed = bool(np.any(self.failed) if self.runs else self.failed)
         # Whether there is a fusion rule, and a channel to use it.
         self.has_fusion = filter_.fusion is not None and self.channel is not None
         self.pending: tuple[Observation, ...] = ()
@@ -254,9 +254,9 @@ class Step(Generic[S]):
             return collect_observations(self)
         # Nothing is exchanged here. A subclass may have put other agents' observations
         # into an agent's list, so a sensor is looked up at the agent that observed.
-        pairs = []
+        pairs: list[list[tuple[Sensor, Array]]] = []
         for agent, observations in enumerate(self.observations):
-            of_agent = []
+            of_agent: list[tuple[Sensor, Array]] = []
             for o in observations:
                 if self.references is not None:
                     self.references.receive(agent, o)
@@ -570,10 +570,12 @@ class Step(Generic[S]):
             kept_times = (*self.lagged, self.t)
             before = self.state.assimilated
             result = [entry for entry in before if entry[0] in kept_times]
-        for entries in (*self.observations, self.delayed):
-            for o in entries:
-                # The user may change the array before the next step.
-                result.append((o.t, o.agent, o.sensor, o.value.copy(), o.metadata))
+        # The user may change the arrays before the next step.
+        result += [
+            (o.t, o.agent, o.sensor, o.value.copy(), o.metadata)
+            for entries in (*self.observations, self.delayed)
+            for o in entries
+        ]
         return tuple(result)
 
     # What is said once ----------------------------------------------------------------
@@ -658,7 +660,7 @@ class Received:
     target: Array
 
     def __init__(
-        self, agents: list[int], sensors: Sequence[tuple[Sensor, ...]]
+        self, agents: list[int], sensors: Mapping[int, tuple[Sensor, ...]]
     ) -> None:
         self.agents = np.array(agents, dtype=np.intp)
         # A slice gives views, where a list of numbers copies.
@@ -677,6 +679,8 @@ class Received:
                 self.sensor_index[g, start : start + sensor.dim] = k
                 start += sensor.dim
         self.parts = [self._make_part(*item) for item in starts.items()]
+        # Sensors whose derivative is made by differences, or not yet compared with them.
+        self._differenced = [part.sensor for part in self.parts]
         self.noise = self._assemble_noise(starts)
         self.linear = all(sensor.linear is not None for sensor in starts)
         self.changes = any(sensor.uses_previous for sensor in starts)
@@ -996,10 +1000,12 @@ class Received:
         if self.linear:
             return np.full((*self.target.shape, d), self.H(d))
         std = None
-        if cov is not None and any(
-            [needs_differences(part.sensor) for part in self.parts]
-        ):
-            std = deviations(cov)
+        if self._differenced:
+            # In place: all groups of the pattern have the same list.
+            remaining = [s for s in self._differenced if needs_differences(s)]
+            self._differenced[:] = remaining
+            if cov is not None and remaining:
+                std = deviations(cov)
         if self.has_one_part:
             return self.parts[0].sensor.jacobian(states, std=std)
         result = np.empty((*self.target.shape, d))
@@ -1102,26 +1108,30 @@ def _gather_predictions(
     return gather(values, sensor.bring_near, tangent, fallback)
 
 
+_Pattern = tuple[tuple[int, tuple[Sensor, ...]], ...]
+"""Which agents have observations, and of which sensors."""
+
+
 @lru_cache(maxsize=1024)
-def _plan_few(pattern: tuple[tuple[Sensor, ...], ...]) -> list[Received]:
+def _plan_few(pattern: _Pattern) -> list[Received]:
     """Plan the groups of a few agents, of whose events many patterns recur."""
     return _plan_groups(pattern)
 
 
 @lru_cache(maxsize=32)
-def _plan_many(pattern: tuple[tuple[Sensor, ...], ...]) -> list[Received]:
+def _plan_many(pattern: _Pattern) -> list[Received]:
     """Plan the groups of many agents, whose plans are large."""
     return _plan_groups(pattern)
 
 
-def _plan_groups(pattern: tuple[tuple[Sensor, ...], ...]) -> list[Received]:
-    """Plan a group for each number of values that occurs; agents without any are left out."""
+def _plan_groups(pattern: _Pattern) -> list[Received]:
+    """Plan a group for each number of values that occurs."""
     agents_by_size: dict[int, list[int]] = {}
-    for agent, sensors in enumerate(pattern):
-        if sensors:
-            size = sum(sensor.dim for sensor in sensors)
-            agents_by_size.setdefault(size, []).append(agent)
-    return [Received(agents, pattern) for _, agents in sorted(agents_by_size.items())]
+    for agent, sensors in pattern:
+        size = sum(sensor.dim for sensor in sensors)
+        agents_by_size.setdefault(size, []).append(agent)
+    by_agent = dict(pattern)
+    return [Received(agents, by_agent) for _, agents in sorted(agents_by_size.items())]
 
 
 def group_agents(
@@ -1134,9 +1144,15 @@ def group_agents(
     >>> group_agents([[], []])
     []
     """
-    # The pattern of sensors is the key of the plan.
-    pattern = tuple([tuple([s for s, _ in pairs]) for pairs in observations])
-    plans = _plan_few(pattern) if len(pattern) <= _FEW else _plan_many(pattern)
+    # The pattern of sensors is the key of the plan; agents without any are left out.
+    pattern = tuple(
+        [
+            (agent, tuple([sensor for sensor, _ in pairs]))
+            for agent, pairs in enumerate(observations)
+            if pairs
+        ]
+    )
+    plans = _plan_few(pattern) if len(observations) <= _FEW else _plan_many(pattern)
     groups = []
     for plan in plans:
         values = [v for agent in plan.agents.tolist() for _, v in observations[agent]]

@@ -152,7 +152,7 @@ class Channel:
     @classmethod
     def construct(cls, *args: object, **options: object) -> Channel:
         """Build a channel without checks, from a graph and a ledger that the library made."""
-        make = cast(Callable[..., Channel], cls)
+        make: Callable[..., Channel] = cls
         with skip_validation():
             return make(*args, **options)
 

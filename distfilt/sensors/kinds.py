@@ -20,7 +20,7 @@ from ..validation import (
     validated,
 )
 from ..validation.checks import check_distinct
-from .base import Sensor, wrap
+from .base import Sensor, wrap_angles
 from .likelihood import LikelihoodSensor
 
 __all__ = [
@@ -407,20 +407,39 @@ def _offset(
     x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
 ) -> Array:
     """Return the vector from the sensor to the place that some components form."""
-    place = x[..., list(observer[: len(indices)])] if observer else origin
-    return np.asarray(x[..., list(indices)] - place)
+    place = origin
+    if observer:
+        place = x[..., _columns(observer[: len(indices)], x.shape[-1])]
+    return np.asarray(x[..., _columns(indices, x.shape[-1])] - place)
 
 
-def _own_heading(x: Array, indices: Sequence[int], observer: Sequence[int]) -> Array:
+def _columns(indices: Sequence[int], dim: int) -> slice | list[int]:
+    """Return an index of components: a slice, which copies nothing, if they are neighbours.
+
+    >>> _columns([2, 3], 4), _columns([3, 2], 4), _columns([3, 4], 4)
+    (slice(2, 4, None), [3, 2], [3, 4])
+    """
+    columns = list(indices)
+    stop = columns[0] + len(columns)
+    # A slice beyond the last component would lose some without an error.
+    if stop <= dim and columns == list(range(columns[0], stop)):
+        return slice(columns[0], stop)
+    return columns
+
+
+def _own_heading(
+    x: Array, indices: Sequence[int], observer: Sequence[int]
+) -> Array | float:
     """Return the heading of a sensor on a body of the state, zero without one."""
     if len(observer) <= len(indices):
-        return np.zeros(x.shape[:-1])
+        return 0.0
     return np.asarray(x[..., observer[len(indices)]])
 
 
 def _norm(vectors: Array) -> Array:
     """Return lengths with a last axis of one."""
-    return np.asarray(np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True)))
+    squares = vectors * vectors
+    return np.asarray(np.sqrt(np.add.reduce(squares, axis=-1, keepdims=True)))
 
 
 def _scatter(
@@ -429,9 +448,9 @@ def _scatter(
     """Return derivatives (..., m, n) by an offset as those by all `dim` components."""
     # The other components do not enter.
     jacobian = np.zeros((*slope.shape[:-1], dim))
-    jacobian[..., list(indices)] = slope
+    jacobian[..., _columns(indices, dim)] = slope
     if observer:
-        jacobian[..., list(observer[: len(indices)])] = -slope
+        jacobian[..., _columns(observer[: len(indices)], dim)] = -slope
     return jacobian
 
 
@@ -454,7 +473,16 @@ def _distance_jacobian(
 def _distance_slope(offset: Array, length: Array) -> Array:
     """Return the derivative of vectors' lengths, and zero at the vector zero."""
     # ∂|v|/∂v = vᵀ / |v|
-    return np.asarray(offset / np.where(length > 0, length, 1.0))
+    return np.asarray(offset / _replace_zeros(length, 1.0))
+
+
+def _replace_zeros(length: Array, value: float) -> Array:
+    """Return lengths with a value in place of those that are not positive."""
+    is_positive = length > 0
+    # The usual case
+    if np.count_nonzero(is_positive) == is_positive.size:
+        return length
+    return np.where(is_positive, length, value)
 
 
 def _angle(
@@ -473,8 +501,9 @@ def _direction(offset: Array, period: float, heading: float | Array) -> Array:
     """Return the angles of vectors (..., 2) from a heading, NaN for the vector zero."""
     angle = np.arctan2(offset[..., 1], offset[..., 0])
     # arctan2(0, 0) is 0, but the sensor's own place has no direction.
-    angle = np.where(offset.any(axis=-1), angle, np.nan)
-    return wrap(angle - heading, period=period)[..., None]
+    if np.count_nonzero(offset) < offset.size:
+        angle = np.where(offset.any(axis=-1), angle, np.nan)
+    return wrap_angles(angle - heading, period)[..., None]
 
 
 def _angle_jacobian(
@@ -494,7 +523,7 @@ def _angle_slope(offset: Array, length: Array) -> Array:
     """Return the derivative of vectors' angles, and NaN at the vector zero."""
     # ∂ arctan2(b, a) / ∂(a, b) = (-b, a) / (a² + b²); by unit vectors, so that no
     # square overflows.
-    length = np.where(length > 0, length, np.nan)
+    length = _replace_zeros(length, np.nan)
     unit = offset / length
     slope = np.empty(unit.shape)
     slope[..., 0] = -unit[..., 1]
@@ -513,8 +542,10 @@ def _range_bearing(
     """Return distances and bearings (..., 2) of states (..., d) from the sensor."""
     offset = _offset(x, indices, origin, observer)
     total_heading = heading + _own_heading(x, indices, observer)
-    angle = _direction(offset, 2 * np.pi, total_heading)
-    return np.concatenate([_norm(offset), angle], axis=-1)
+    result = np.empty((*offset.shape[:-1], 2))
+    result[..., :1] = _norm(offset)
+    result[..., 1:] = _direction(offset, 2 * np.pi, total_heading)
+    return result
 
 
 def _range_bearing_jacobian(
