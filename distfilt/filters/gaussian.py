@@ -499,22 +499,10 @@ class GaussianFamily(
         common = fold(mean, self.periods) if self.periods else mean
         fused_mean, fused_cov = step.fuse(common, cov)
         fused_mean = fused_mean + (mean - common) if self.periods else fused_mean
-        variance = np.diagonal(fused_cov, axis1=-2, axis2=-1)
-        # A variance that is negative by rounding alone is small beside the largest one.
-        smallest = variance.min()
-        if smallest < 0 and smallest < -1e-9 * np.abs(variance).max():
-            raise ValueError(
-                f"fusion must return a covariance, got a variance of {variance.min():g}"
-            )
-        # A variance below (ε m)² cannot come from independent information.
-        if ((variance > 0) & (variance < (EPS * fused_mean) ** 2)).any():
-            warnings.warn(
-                "covariance after fusion is below rounding at t = "
-                f"{format_number(step.t)} s: "
-                "information is probably counted twice",
-                RuntimeWarning,
-                4,
-            )
+        variance = fused_cov.diagonal(axis1=-2, axis2=-1)
+        # Mostly no variance is negative, or below the rounding of its mean.
+        if np.count_nonzero(variance < (EPS * fused_mean) ** 2):
+            _check_fused(fused_mean, variance, step.t)
         if means.shape[-1] == d:
             return fused_mean, fused_cov
         # With the gain G = P_joint,now P_now⁻¹: m + G Δm and P + G ΔP Gᵀ.
@@ -590,6 +578,24 @@ class GaussianFilter(
     def insert_time(self, state: GaussianState, t: float) -> GaussianState:
         """Return the state with a belief about a time between two that it keeps."""
         return insert_gaussian(self, state, t)
+
+
+def _check_fused(mean: Array, variance: Array, t: float) -> None:
+    """Refuse negative variances after a fusion, and warn of those below rounding."""
+    # A variance that is negative by rounding alone is small beside the largest one.
+    smallest = variance.min()
+    if smallest < -1e-9 * np.abs(variance).max():
+        raise ValueError(
+            f"fusion must return a covariance, got a variance of {smallest:g}"
+        )
+    # A variance below (ε m)² cannot come from independent information.
+    if ((variance > 0) & (variance < (EPS * mean) ** 2)).any():
+        warnings.warn(
+            f"covariance after fusion is below rounding at t = {format_number(t)} s: "
+            "information is probably counted twice",
+            RuntimeWarning,
+            5,
+        )
 
 
 def _factor_covariance(cov: Array) -> tuple[Array, Array]:

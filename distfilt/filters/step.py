@@ -507,7 +507,7 @@ class Step(Generic[S]):
         >>> bool(np.allclose(state.history[0][1], state.ensembles))
         True
         """
-        if not self.has_fusion or self.failed.all():
+        if not self.has_fusion or (self.any_failed and self.failed.all()):
             return values
         return fuse_beliefs(self, values)
 

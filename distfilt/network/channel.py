@@ -475,8 +475,10 @@ class Channel:
         is_broadcast: bool = True,
     ) -> Mask:
         """Send so many floats over some links, all by default; which arrive, (R, E)."""
+        if links is None and self._perfect and is_broadcast and not acknowledged:
+            return self._transmit_everywhere(numbers)
         if links is None:
-            links = np.ones(self.graph.senders.size, dtype=bool)
+            links = self.graph._every_link
         size = _Size.of_floats(numbers)
         if not is_broadcast:
             size = _Size(numbers, 8 * numbers)
@@ -493,6 +495,20 @@ class Channel:
             arrived = self._transmit_rounds(1, used, size, acknowledged=acknowledged)
             return np.asarray(arrived[0])
         self._charge(used[None], size, acknowledged=acknowledged)
+        return self._repeat_for_runs(used)
+
+    def _transmit_everywhere(self, numbers: int) -> Mask:
+        """Send so many floats over every link of a channel without faults, and charge that."""
+        graph = self.graph
+        ledger = self._ledger
+        rounds = ledger.rounds + (1 if graph.senders.size else 0)
+        bill = graph._bill_of_floats(numbers)
+        new = [getattr(ledger, name) + n for name, n in zip(_BILLS, bill, strict=True)]
+        self._ledger = Ledger.construct(rounds, *new[:3], ledger.lost, *new[3:])
+        return self._repeat_for_runs(graph._every_link)
+
+    def _repeat_for_runs(self, used: Mask) -> Mask:
+        """Return the links in use, (E,), for each run of this channel, (R, E)."""
         if self._n_drawn == 1:
             return used[None]
         everywhere = np.broadcast_to(used, (self._n_drawn, used.size))
@@ -536,7 +552,7 @@ class Channel:
         """Enter rounds of mixing without faults, in which every link carries a message."""
         uncharged = self._uncharged
         self._uncharged = {}
-        every_link = np.ones((1, self.graph.senders.size), dtype=bool)
+        every_link = self.graph._every_link[None]
         for numbers, rounds in uncharged.items():
             self._charge(every_link, _Size.of_floats(numbers), repeated=rounds)
 

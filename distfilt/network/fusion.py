@@ -46,6 +46,10 @@ __all__ = [
 
 def _find_uncertain(covs: Array) -> Mask:
     """Return which components have a variance, (d,); the others are constants known to all."""
+    # The usual case: all variances are positive.
+    variances = covs.diagonal(axis1=-2, axis2=-1)
+    if np.count_nonzero(variances) == variances.size:
+        return np.ones(covs.shape[-1], dtype=bool)
     # A component with a covariance but no variance is left to the check of definiteness.
     rows = (covs != 0).reshape(-1, covs.shape[-1])
     return np.asarray(rows.any(axis=0))
@@ -562,11 +566,11 @@ def _intersection_weights(received: _Received, rule: Rule) -> Pair:
     if rule.startswith("min"):
         return _optimal_weights(received, rule)
     graph = received.graph
-    size = np.ones(received.means.shape[:2])
-    if rule == "equal" and received.arrived.all():
+    arrived = received.arrived
+    if rule == "equal" and np.count_nonzero(arrived) == arrived.size:
         # Each agent's number of messages belongs to the graph.
-        total = size + graph.in_degree
-        return size / total, 1 / total[:, graph.receivers]
+        return graph._equal_weights
+    size = np.ones(received.means.shape[:2])
     if rule != "equal":
         # Weights are proportional to a size of each covariance: its weight against a
         # unit covariance, over that one's. No agent's number depends on another's in
