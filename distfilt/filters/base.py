@@ -107,6 +107,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
     names: Sequence[str] = ()
 
     state_class: ClassVar[type[State]] = State
+    has_sensors: ClassVar[bool] = False
     requires_rng: ClassVar[bool] = False
     supports_runs: ClassVar[bool] = True
     batched_summary: ClassVar[bool] = False
@@ -349,7 +350,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         # `failed` of a SensorState has one entry for each run.
         runs = state.failed.shape if isinstance(state, SensorState) else state.runs
         read = self.read_observations(observations, runs, t)
-        sensor_filter = self if isinstance(self, SensorFilter) else None
+        sensor_filter = cast("SensorFilter[S]", self) if self.has_sensors else None
         matched: Sequence[Observation] = ()
         if delayed:
             moved = insert_times(self, delayed, state, t, reuse_rng=reuse_rng)
@@ -583,6 +584,7 @@ class SensorFilter(Filter[S]):
     _: KW_ONLY
     gate_probability: Annotated[float, Bounds(above=0, below=1)] | None = None
 
+    has_sensors: ClassVar[bool] = True
     supports_increments: ClassVar[bool] = False
     supports_likelihoods: ClassVar[bool] = False
     supports_agent_models: ClassVar[bool] = False
@@ -830,15 +832,16 @@ class SensorFilter(Filter[S]):
                 result.append([])
                 continue
             if type(entry) is list:
-                if not all([self._fits(o, agent, runs, t) for o in entry]):
-                    return read_observations(self, observations, runs, t)
-                result.append(list(entry))
+                for o in entry:
+                    if not self._fits(o, agent, runs, t):
+                        return read_observations(self, observations, runs, t)
+                result.append(entry.copy())
                 continue
             if (
                 type(entry) is not np.ndarray
                 or entry.dtype != _FLOAT64
                 or entry.shape != (*runs, size)
-                or np.count_nonzero(np.isfinite(entry)) < entry.size
+                or not all_finite(entry)
             ):
                 return read_observations(self, observations, runs, t)
             result.append([Observation.construct(t, agent, entry)])

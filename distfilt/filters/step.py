@@ -151,7 +151,7 @@ class Step(Generic[S]):
         # How many observations cannot be seen from a belief, if there are any.
         self.unseen: Array | None = None
         self.warned: tuple[str, ...] = state.warned
-        self.has_sensors = hasattr(filter_, "agent_sensors")
+        self.has_sensors = filter_.has_sensors
         # Sensors of changes need the beliefs about the times of their last observations.
         self.lagged = self.times
         self.references: References | None = None

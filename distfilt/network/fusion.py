@@ -489,8 +489,8 @@ class _Received:
 
         Angles differ by the shorter way round.
         """
-        senders = self.means[:, self.graph.senders]
-        difference = senders - self.means[:, self.graph.receivers]
+        of_sender = self.means.take(self.graph.senders, axis=1)
+        difference = of_sender - self.means.take(self.graph.receivers, axis=1)
         if self.periods:
             difference = wrap_differences(difference, self.periods)
         return difference
@@ -618,7 +618,7 @@ def _sum_information(
     information = _invert(received.covs)
     # m = m_i + P Σ_j ω_j P_j⁻¹ (m_j - m_i): about the own mean, so that equal means
     # stay and large ones lose no digits.
-    of_sender = information[:, graph.senders]
+    of_sender = information.take(graph.senders, axis=1)
     pull = of_sender @ received.mean_differences()[..., None]
     # One sum over the links for ω_j P_j⁻¹ and, as a further column, for the pull.
     terms = np.concatenate([of_sender, pull], axis=-1)
@@ -640,10 +640,10 @@ def _invert(spd: Array) -> Array:
         inverse = solve_lower(cholesky(spd), unit)
         return np.asarray(inverse.swapaxes(-1, -2) @ inverse)
     # A few matrices are solved faster one by one, P X = I by Cholesky.
-    solutions = []
-    for matrix in spd.reshape(n, d, d):
-        _, solution, failed = dposv(matrix, identity(d), lower=1)
+    unit = identity(d)
+    solutions = np.empty((n, d, d))
+    for k, matrix in enumerate(spd.reshape(n, d, d)):
+        _, solutions[k], failed = dposv(matrix, unit, lower=1)
         if failed:
             raise np.linalg.LinAlgError("Matrix is not positive definite")
-        solutions.append(solution)
-    return np.array(solutions).reshape(spd.shape)
+    return solutions.reshape(spd.shape)

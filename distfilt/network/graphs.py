@@ -187,10 +187,10 @@ class Graph(FrozenModel):
             before = per_link.shape[:axis]
             behind = per_link.shape[axis + 1 :]
             by_agent = per_link.reshape(*before, self.n_agents, self._degree, *behind)
-            terms = np.moveaxis(by_agent, axis + 1, 0)
-            total = 0.0 + terms[0]
-            for term in terms[1:]:
-                total += term
+            lead = (slice(None),) * (axis + 1)
+            total = 0.0 + by_agent[(*lead, 0)]
+            for k in range(1, self._degree):
+                total += by_agent[(*lead, k)]
             return np.asarray(total)
         # One sparse product over all other axes at once.
         links_first = per_link.swapaxes(axis, 0)
