@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 
 from ..derivatives import needs_differences
-from ..gaussians.single import condition, unscented_points
+from ..gaussians.single import condition, condition_complete, unscented_points
 from ..linalg import (
     EPS,
     cholesky,
@@ -351,9 +351,7 @@ class GaussianFamily(
             block = slice(first, first + d)
             mean = joint_mean[..., block]
             cov = joint_cov[..., block, block]
-        group, predicted, slope, extra = self._predict(mean, cov, group, step)
-        # r = y* - h(m); NaN where a component is missing, which `condition` leaves out.
-        innovation = group.target - predicted
+        group, innovation, slope, extra = self._innovate(mean, cov, group, step)
         if self.iterations > 1 and not group.linear:
             innovation, slope = self._relinearize(
                 mean, cov, innovation, slope, group, step
@@ -367,8 +365,9 @@ class GaussianFamily(
         if extra is not None:
             # S = H P Hᵀ + R, where the extra covariance of the unscented points counts as noise.
             arrays = (*arrays, group.noise + extra)
+        is_complete = all_finite(innovation)
         new_mean, new_cov = step.apply(
-            _condition_rows,
+            _condition_complete_rows if is_complete else _condition_rows,
             arrays,
             (joint_mean, joint_cov),
             group.agents,
@@ -418,20 +417,23 @@ class GaussianFamily(
             slope = np.where(is_blind[..., None], slope, new_slope)
         return innovation, slope
 
-    def _predict(
+    def _innovate(
         self, mean: Array, cov: Array, group: Received, step: Step[GaussianState]
     ) -> tuple[Received, Array, Array, Array | None]:
-        """Predict a group's observations by Gaussians (*runs, G, d) of their time.
+        """Compare a group's observations with predictions by Gaussians (*runs, G, d).
 
-        Returns the group without the observations that the gate rejects, the predictions, NaN
-        where the sensor cannot see, their slope, and their extra covariance, if any.
+        Returns the group without the observations that the gate rejects, and the innovations
+        r = y - h(m), NaN where a number is missing or the sensor cannot see it. Behind them come
+        the slope of the predictions, and their extra covariance, if any.
         """
-        linear = group.linear
-        predict = partial(group.predict, branch="first")
         predicted, slope, extra = self._linearize(
-            predict, group.jacobian, mean, cov, linear
+            partial(group.predict, branch="first"),
+            group.jacobian,
+            mean,
+            cov,
+            group.linear,
         )
-        if not linear:
+        if not group.linear:
             # Mostly everything is seen, and each number depends on the state: 0 < Σ H² < ∞.
             steepness = np.vecdot(slope, slope)
             is_steep = np.count_nonzero(steepness) == steepness.size
@@ -448,7 +450,7 @@ class GaussianFamily(
                 return predicted, predicted_cov
 
             group = step.gate(group, moments, predicted[..., None, :])
-        return group, predicted, slope, extra
+        return group, group.target - predicted, slope, extra
 
     def _leave_out_unseen(
         self,
@@ -629,6 +631,17 @@ def _fill_zero_columns(root: Array) -> Array:
     if not np.count_nonzero(is_zero):
         return root
     return np.asarray(root + np.where(is_zero[..., None], np.eye(root.shape[-1]), 0.0))
+
+
+def _condition_complete_rows(
+    mean: Array,
+    cov: Array,
+    innovation: Array,
+    slope: Array,
+    noise: Array,
+    *_: object,
+) -> tuple[Array, Array]:
+    return condition_complete(mean, cov, innovation, slope, noise)
 
 
 def _condition_rows(
