@@ -238,7 +238,9 @@ class GaussianFamily(
         if not dt:
             return state.joint_means.copy(), state.joint_covariances.copy()
         d = state.dim
-        if self.periods or self.notices_wrapping:
+        # A single point cannot lie on both sides of a cut.
+        has_points = self.linearization == "unscented"
+        if self.periods or (self.notices_wrapping and has_points):
             move = partial(self._step_points, step)
         else:
             move = partial(model.step, t=state.t, dt=dt)
@@ -433,12 +435,15 @@ class GaussianFamily(
             cov,
             group.linear,
         )
+        innovation = group.target - predicted
+        is_complete = all_finite(innovation)
         if not group.linear:
             # Mostly everything is seen, and each number depends on the state: 0 < Σ H² < ∞.
             steepness = np.vecdot(slope, slope)
             is_steep = np.count_nonzero(steepness) == steepness.size
-            if not (is_steep and all_finite(steepness) and all_finite(predicted)):
+            if not (is_steep and all_finite(steepness) and is_complete):
                 predicted = self._leave_out_unseen(predicted, slope, group, step)
+                innovation = group.target - predicted
 
         if step.tests_innovations:
 
@@ -450,7 +455,8 @@ class GaussianFamily(
                 return predicted, predicted_cov
 
             group = step.gate(group, moments, predicted[..., None, :])
-        return group, group.target - predicted, slope, extra
+            innovation = group.target - predicted
+        return group, innovation, slope, extra
 
     def _leave_out_unseen(
         self,

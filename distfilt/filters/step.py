@@ -145,13 +145,16 @@ class Step(Generic[S]):
         self.failed: Mask = getattr(state, "failed", _NO_RUNS)
         self.runs: tuple[int, ...] = self.failed.shape
         self.any_failed = bool(np.any(self.failed) if self.runs else self.failed)
+        # The model of the agents' states, (*runs, A, ..., d).
+        self.has_sensors = filter_.has_sensors
+        if self.has_sensors:
+            self.model = self.filter.model_of_states(self.runs)
         # Whether there is a fusion rule, and a channel to use it.
         self.has_fusion = filter_.fusion is not None and self.channel is not None
         self.pending: tuple[Observation, ...] = ()
         # How many observations cannot be seen from a belief, if there are any.
         self.unseen: Array | None = None
         self.warned: tuple[str, ...] = state.warned
-        self.has_sensors = filter_.has_sensors
         # Sensors of changes need the beliefs about the times of their last observations.
         self.lagged = self.times
         self.references: References | None = None
@@ -171,11 +174,6 @@ class Step(Generic[S]):
         if filter_.record_evidence:
             for name in ("log_likelihood", "nis", "n_observed"):
                 self.scores[name] = np.zeros((*self.runs, filter_.n_agents))
-
-    @property
-    def model(self) -> Model:
-        """The model of the agents' states, (*runs, A, ..., d)."""
-        return self.filter.model_of_states(self.runs)
 
     @property
     def tests_innovations(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Annotated, Literal, TypedDict, cast
 
 import numpy as np
@@ -367,9 +367,9 @@ def range_bearing(
 class _Geometry(TypedDict):
     """The arguments that the functions below share."""
 
-    indices: Sequence[int]
+    indices: tuple[int, ...]
     origin: Array
-    observer: Sequence[int]
+    observer: tuple[int, ...]
 
 
 def _geometry(
@@ -387,7 +387,7 @@ def _geometry(
     # A copy: the caller's array may be that of a robot that moves on.
     place = np.array(0.0 if origin is None else origin)
     if observer is None:
-        return {"indices": indices, "origin": place, "observer": ()}
+        return {"indices": tuple(indices), "origin": place, "observer": ()}
     if origin is not None:
         raise ValueError("origin must be None for a sensor on a body of the state")
     n = len(indices)
@@ -400,11 +400,15 @@ def _geometry(
         raise ValueError(
             f"observer must have other components than indices, got {list(observer)}"
         )
-    return {"indices": indices, "origin": place, "observer": observer}
+    return {
+        "indices": tuple(indices),
+        "origin": place,
+        "observer": tuple(observer),
+    }
 
 
 def _offset(
-    x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
+    x: Array, indices: tuple[int, ...], origin: Array, observer: tuple[int, ...]
 ) -> Array:
     """Return the vector from the sensor to the place that some components form."""
     place = origin
@@ -413,10 +417,11 @@ def _offset(
     return np.asarray(x[..., _columns(indices, x.shape[-1])] - place)
 
 
-def _columns(indices: Sequence[int], dim: int) -> slice | list[int]:
+@lru_cache(maxsize=256)
+def _columns(indices: tuple[int, ...], dim: int) -> slice | list[int]:
     """Return an index of components: a slice, which copies nothing, if they are neighbours.
 
-    >>> _columns([2, 3], 4), _columns([3, 2], 4), _columns([3, 4], 4)
+    >>> _columns((2, 3), 4), _columns((3, 2), 4), _columns((3, 4), 4)
     (slice(2, 4, None), [3, 2], [3, 4])
     """
     columns = list(indices)
@@ -428,7 +433,7 @@ def _columns(indices: Sequence[int], dim: int) -> slice | list[int]:
 
 
 def _own_heading(
-    x: Array, indices: Sequence[int], observer: Sequence[int]
+    x: Array, indices: tuple[int, ...], observer: tuple[int, ...]
 ) -> Array | float:
     """Return the heading of a sensor on a body of the state, zero without one."""
     if len(observer) <= len(indices):
@@ -443,7 +448,7 @@ def _norm(vectors: Array) -> Array:
 
 
 def _scatter(
-    slope: Array, indices: Sequence[int], observer: Sequence[int], dim: int
+    slope: Array, indices: tuple[int, ...], observer: tuple[int, ...], dim: int
 ) -> Array:
     """Return derivatives (..., m, n) by an offset as those by all `dim` components."""
     # The other components do not enter.
@@ -455,14 +460,14 @@ def _scatter(
 
 
 def _distance(
-    x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
+    x: Array, indices: tuple[int, ...], origin: Array, observer: tuple[int, ...]
 ) -> Array:
     """Return distances (..., 1) of states (..., d) from the sensor."""
     return _norm(_offset(x, indices, origin, observer))
 
 
 def _distance_jacobian(
-    x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
+    x: Array, indices: tuple[int, ...], origin: Array, observer: tuple[int, ...]
 ) -> Array:
     """Return the derivatives (..., 1, d) of distances."""
     offset = _offset(x, indices, origin, observer)
@@ -488,9 +493,9 @@ def _replace_zeros(length: Array, value: float) -> Array:
 def _angle(
     x: Array,
     period: float,
-    indices: Sequence[int],
+    indices: tuple[int, ...],
     origin: Array,
-    observer: Sequence[int],
+    observer: tuple[int, ...],
 ) -> Array:
     """Return directions (..., 1) of states (..., d) from the sensor."""
     offset = _offset(x, indices, origin, observer)
@@ -507,7 +512,7 @@ def _direction(offset: Array, period: float, heading: float | Array) -> Array:
 
 
 def _angle_jacobian(
-    x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
+    x: Array, indices: tuple[int, ...], origin: Array, observer: tuple[int, ...]
 ) -> Array:
     """Return the derivatives (..., 1, d) of directions, NaN at the sensor's own place."""
     offset = _offset(x, indices, origin, observer)
@@ -535,9 +540,9 @@ def _angle_slope(offset: Array, length: Array) -> Array:
 def _range_bearing(
     x: Array,
     heading: float,
-    indices: Sequence[int],
+    indices: tuple[int, ...],
     origin: Array,
-    observer: Sequence[int],
+    observer: tuple[int, ...],
 ) -> Array:
     """Return distances and bearings (..., 2) of states (..., d) from the sensor."""
     offset = _offset(x, indices, origin, observer)
@@ -549,15 +554,22 @@ def _range_bearing(
 
 
 def _range_bearing_jacobian(
-    x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
+    x: Array, indices: tuple[int, ...], origin: Array, observer: tuple[int, ...]
 ) -> Array:
     """Return the derivatives (..., 2, d) of distances and bearings."""
     # A constant heading only shifts the bearing, so that it does not enter.
     offset = _offset(x, indices, origin, observer)
     length = _norm(offset)
+    positive = _replace_zeros(length, np.nan)
+    unit = offset / positive
     slopes = np.empty((*offset.shape[:-1], 2, 2))
-    slopes[..., 0, :] = _distance_slope(offset, length)
-    slopes[..., 1, :] = _angle_slope(offset, length)
+    # As in `_distance_slope` and `_angle_slope`
+    slopes[..., 0, :] = unit
+    if positive is not length:
+        slopes[..., 0, :] = _distance_slope(offset, length)
+    slopes[..., 1, 0] = -unit[..., 1]
+    slopes[..., 1, 1] = unit[..., 0]
+    slopes[..., 1, :] /= positive
     jacobian = _scatter(slopes, indices, observer, x.shape[-1])
     if len(observer) > len(indices):
         turn = observer[len(indices)]
