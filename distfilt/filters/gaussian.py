@@ -114,11 +114,13 @@ class GaussianState(SensorState):
     @property
     def means(self) -> Array:
         """Means of the present state, (*runs, A, d)."""
-        return self.joint_means[..., : self.dim]
+        return self.joint_means[..., : self.dim] if self.history else self.joint_means
 
     @property
     def covariances(self) -> Array:
         """Covariances of the present state, (*runs, A, d, d)."""
+        if not self.history:
+            return self.joint_covariances
         return self.joint_covariances[..., : self.dim, : self.dim]
 
 
@@ -260,7 +262,7 @@ class GaussianFamily(
             noise = model.Q(state.t, dt)
         if extra is not None:
             noise = noise + extra
-        cov = slope @ old[..., :d, :d] @ slope.mT + noise
+        cov = slope @ state.covariances @ slope.mT + noise
         size = len(step.times) * d
         if size:
             # The past keeps its covariance; its cross-covariance with the present becomes F P.

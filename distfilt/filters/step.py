@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, ca
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..derivatives import needs_differences
+from ..derivatives import call_derivative, needs_differences
 from ..linalg import cholesky, deviations, log_det, quadratic_form
 from ..models import Model
 from ..periods import check_sensor, gather
@@ -525,21 +525,27 @@ class Step(Generic[S]):
         if isinstance(state, SensorState):
             if self.times or self.references is not None:
                 belief |= self._describe_past(past, belief)
-            belief["unseen"] = self.unseen
             belief["failed"] = self.failed
-            belief["pending"] = self.pending
+            # A long run keeps many states: what has its default takes no place.
+            if self.unseen is not None:
+                belief["unseen"] = self.unseen
+            if self.pending:
+                belief["pending"] = self.pending
         if self.has_sensors:
             belief["assimilated"] = self._note_assimilated()
-            belief["warned"] = self.warned
+            if self.warned:
+                belief["warned"] = self.warned
         if self.streaks is not None:
             belief["rejection_streaks"] = self.streaks.counts
+        if self.rejected is not None:
+            belief["rejected"] = self.rejected
         # The messages in the step are in the channel's ledger.
         ledger = state.ledger if self.channel is None else self.channel.ledger
         # A failed run has no score.
         for name, values in self.scores.items():
             self.scores[name] = self.keep_failed(values, np.nan)
         new: S = type(state).construct(
-            self.t, ledger, self.rng, rejected=self.rejected, **self.scores, **belief
+            self.t, ledger, self.rng, **self.scores, **belief
         )
         return new
 
@@ -568,12 +574,13 @@ class Step(Generic[S]):
             kept_times = (*self.lagged, self.t)
             before = self.state.assimilated
             result = [entry for entry in before if entry[0] in kept_times]
-        # The user may change the arrays before the next step.
-        result += [
-            (o.t, o.agent, o.sensor, o.value.copy(), o.metadata)
-            for entries in (*self.observations, self.delayed)
-            for o in entries
-        ]
+        for entries in (*self.observations, self.delayed):
+            for o in entries:
+                # The user may change the array before the next step, unless it is a frozen copy.
+                flags = o.value.flags
+                is_frozen = flags.owndata and not flags.writeable
+                value = o.value if is_frozen else o.value.copy()
+                result.append((o.t, o.agent, o.sensor, value, o.metadata))
         return tuple(result)
 
     # What is said once ----------------------------------------------------------------
@@ -968,7 +975,7 @@ class Received:
             check = name_of_check("h", states)
             if not sensor.uses_previous and not needs_check(sensor, check):
                 self._checked.add((sensor, is_single))
-        if self.wraps and sensor.wraps and branch != "each":
+        if sensor.wraps and branch != "each" and states.shape[-2] > 1:
             return _gather_predictions(sensor, values, states, previous)
         return values
 
@@ -1005,7 +1012,12 @@ class Received:
             if cov is not None and remaining:
                 std = deviations(cov)
         if self.has_one_part:
-            return self.parts[0].sensor.jacobian(states, std=std)
+            sensor = self.parts[0].sensor
+            if self._differenced or sensor.derivative is None or self.changes:
+                return sensor.jacobian(states, std=std)
+            return call_derivative(
+                sensor.derivative, (states,), (*self.target.shape, d)
+            )
         result = np.empty((*self.target.shape, d))
         for part in self.parts:
             # H of the sensor's agents, (*runs, agents, m, d)
