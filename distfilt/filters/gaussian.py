@@ -345,8 +345,11 @@ class GaussianFamily(
         d = self.model.dim
         rows = group.rows
         is_part = len(group.agents) < means.shape[-2]
-        joint_mean = means[..., rows, :] if is_part else means
-        joint_cov = covs[..., rows, :, :] if is_part else covs
+        joint_mean = means
+        joint_cov = covs
+        if is_part:
+            joint_mean = means[..., rows, :]
+            joint_cov = covs[..., rows, :, :]
         mean = joint_mean
         cov = joint_cov
         if mean.shape[-1] > d:

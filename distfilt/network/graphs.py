@@ -220,6 +220,15 @@ class Graph(FrozenModel):
         return int(degrees[0]) if is_regular else 0
 
     @cached_property
+    def _receivers_of(self) -> list[list[int]]:
+        """The agents that receive from each agent, ascending."""
+        result: list[list[int]] = [[] for _ in range(self.n_agents)]
+        pairs = zip(self.receivers.tolist(), self.senders.tolist(), strict=True)
+        for receiver, sender in pairs:
+            result[sender].append(receiver)
+        return result
+
+    @cached_property
     def _every_link(self) -> Mask:
         """True for each link, (E,), read-only."""
         links = np.ones(self.senders.size, dtype=bool)
