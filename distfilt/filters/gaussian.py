@@ -268,7 +268,12 @@ class GaussianFamily(
             # The past keeps its covariance; its cross-covariance with the present becomes F P.
             mean = np.concatenate([mean, state.joint_means[..., :size]], axis=-1)
             cross = slope @ old[..., :d, :size]
-            cov = np.block([[cov, cross], [cross.mT, old[..., :size, :size]]])
+            joint = np.empty((*mean.shape, d + size))
+            joint[..., :d, :d] = cov
+            joint[..., :d, d:] = cross
+            joint[..., d:, :d] = cross.mT
+            joint[..., d:, d:] = old[..., :size, :size]
+            cov = joint
         if self.inflation != 1.0:
             # Rows and columns of the present, so that its own block gets the square.
             cov[..., :d, :] *= self.inflation

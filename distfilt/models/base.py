@@ -40,6 +40,7 @@ from ..validation import (
 )
 from ..validation.checks import all_finite, is_nonnegative_diagonal
 from ..validation.clocks import warn_of_clock
+from ..validation.decorators import is_of_library
 
 __all__ = ["LinearModel", "Model", "simulate"]
 
@@ -158,9 +159,11 @@ class Model(FrozenModel):
         q = call_user(self.noise_cov, t, dt)
         # Whether it is finite and a covariance is checked once for each value.
         q = check_array(q, "noise_cov", (self.dim, self.dim), finite=False)
-        is_large = self.dim > _SMALL
-        if is_large and all_finite(q) and is_nonnegative_diagonal(q):
-            # Of such a one the check takes less time than to look it up.
+        # What the library computes is a covariance if it is finite; a large diagonal one takes
+        # less time to check than to look up.
+        is_trusted = is_of_library(self.noise_cov)
+        is_plain = is_trusted or (self.dim > _SMALL and is_nonnegative_diagonal(q))
+        if is_plain and all_finite(q):
             q = q.copy()
             q.setflags(write=False)
             return q
