@@ -18,7 +18,6 @@ from ..network.channel import Payload
 from ..sensors import Sensor
 from ..validation import (
     Array,
-    all_finite,
     call_user,
     check_array,
     format_number,
@@ -57,9 +56,9 @@ def collect_observations(step: Step[AnyState]) -> Known:
     has_waited = bool(cast(SensorState, step.state).pending)
     sent_labels = _label(step, sent) if has_waited else own_labels
     by_time: Known = {}
+    # Most filters have neither a gate nor sensors of changes.
+    is_noted = step.streaks is not None or step.references is not None
     for agent, messages in enumerate(inbox):
-        if not messages and not observed[agent]:
-            continue
         # In order of the senders, so that all agents with the same set have the same order.
         for sender in sorted((agent, *messages)):
             if sender == agent:
@@ -71,7 +70,8 @@ def collect_observations(step: Step[AnyState]) -> Known:
                 listed = sent[sender]
                 payload = messages[sender]
                 values = list(payload) if isinstance(payload, tuple) else [payload]
-            _note_received(step, agent, listed)
+            if is_noted:
+                _note_received(step, agent, listed)
             # The part behind the values counts as communication alone.
             for (t, sensor), value in zip(times_and_sensors, values, strict=False):
                 if t not in by_time:
@@ -287,7 +287,7 @@ def _apply_rule(
         # Mostly it is an array that fits: then nothing has to be converted.
         if type(new) is np.ndarray and new.dtype == np.float64:
             fits = new.shape == old.shape
-            if fits and all_finite(new):
+            if fits and math.isfinite(np.vdot(new, new)):
                 checked.append(new)
                 continue
         checked.append(check_array(new, "fusion", old.shape))

@@ -23,7 +23,7 @@ from ..linalg import cholesky, deviations, log_det, quadratic_form
 from ..models import Model
 from ..periods import check_sensor, gather
 from ..sensors import LikelihoodSensor, Sensor
-from ..validation import Array, Indices, Mask, all_finite, call_user, format_number
+from ..validation import Array, Indices, Mask, call_user, format_number
 from ..validation.batching import name_of_check
 from ..validation.first_use import needs_check
 from . import failures
@@ -184,7 +184,8 @@ class Step(Generic[S]):
 
     def check_forecast(self, values: Array, old: Array | float) -> Array:
         """Return a finite forecast (*runs, A, ...), and `old` in failed runs."""
-        if not all_finite(values):
+        # A finite sum of squares proves that all are finite; it may overflow.
+        if not math.isfinite(np.vdot(values, values)):
             # One row for each run and agent.
             lead = len(self.runs) + 1
             errors = failures.find_nonfinite_rows(values, lead, "forecast")
@@ -440,7 +441,7 @@ class Step(Generic[S]):
             )
         # A row may also fail without an error, by overflow for instance.
         for values in results:
-            if not all_finite(values):
+            if not math.isfinite(np.vdot(values, values)):
                 errors |= failures.find_nonfinite_rows(values, lead, "result")
         if errors:
             # Failed rows keep their values from before the computation.
@@ -905,7 +906,7 @@ class Received:
                 values = self._predict_part(part, of_agents, before, branch)
                 rows[(..., *part.cells, slice(None))] = values.swapaxes(-1, -2)
             result = np.ascontiguousarray(rows.swapaxes(-1, -2))
-        if not all_finite(result) and np.isinf(result).any():
+        if not math.isfinite(np.vdot(result, result)) and np.isinf(result).any():
             raise ValueError(
                 "predicted must have finite numbers or NaN (missing), got infinity"
             )

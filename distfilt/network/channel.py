@@ -496,12 +496,17 @@ class Channel:
             arrived = self._transmit_rounds(1, used, size, acknowledged=acknowledged)
             return np.asarray(arrived[0])
         self._charge(used[None], size, acknowledged=acknowledged)
+        if self._n_drawn == 1:
+            return used[None]
         return self._repeat_for_runs(used)
 
     def _transmit_everywhere(self, numbers: int) -> Mask:
         """Send so many floats over every link of a channel without faults, and charge that."""
-        self._add_to_ledger(self.graph._bill_of_floats(numbers))
-        return self._repeat_for_runs(self.graph._every_link)
+        graph = self.graph
+        self._add_to_ledger(graph._bill_of_floats(numbers))
+        if self._n_drawn == 1:
+            return graph._every_link[None]
+        return self._repeat_for_runs(graph._every_link)
 
     def _charge_broadcast(
         self, sent: Sequence[Payload | None], scalars: Counts, bytes_: Counts
@@ -524,8 +529,6 @@ class Channel:
 
     def _repeat_for_runs(self, used: Mask) -> Mask:
         """Return the links in use, (E,), for each run of this channel, (R, E)."""
-        if self._n_drawn == 1:
-            return used[None]
         everywhere = np.broadcast_to(used, (self._n_drawn, used.size))
         return np.asarray(everywhere[self._drawn])
 

@@ -339,7 +339,7 @@ class Graph(FrozenModel):
                 return_eigenvectors=False,
             )
         except ArpackNoConvergence:
-            return self._degree_bound_gain
+            return self.degree_bound_gain
         return float(2 / largest[0])
 
     @cached_property

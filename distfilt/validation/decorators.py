@@ -263,7 +263,12 @@ def call_user(function: Callable[..., R], *args: object, **options: object) -> R
     >>> call_user(max, 1, 2)
     2
     """
-    if is_of_library(function):
+    # As `is_of_library`, without a call for each call.
+    unwrapped: Callable[..., object] = function
+    while isinstance(unwrapped, partial):
+        unwrapped = unwrapped.func
+    module = getattr(unwrapped, "__module__", None) or ""
+    if module.startswith("distfilt."):
         return function(*args, **options)
     token = _NESTED.set(False)
     try:
