@@ -125,10 +125,12 @@ def _find_unfit(
     for event in events:
         number = event.sensor
         sensors = agent_sensors[event.agent]
-        is_own = type(number) is int and number < len(sensors)
-        expected = (*runs, sensors[number].dim) if is_own else ()
+        expected: tuple[int, ...] | None = None
+        # One that arrives later is looked at again.
         is_punctual = event.arrival_time is None
-        if not (is_own and is_punctual and event.value.shape == expected):
+        if is_punctual and isinstance(number, int) and number < len(sensors):
+            expected = (*runs, sensors[number].dim)
+        if event.value.shape != expected:
             unfit.append(event)
         else:
             fitting.setdefault(event.value.size, []).append(event)

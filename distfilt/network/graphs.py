@@ -186,12 +186,13 @@ class Graph(FrozenModel):
             axis %= per_link.ndim
             before = per_link.shape[:axis]
             behind = per_link.shape[axis + 1 :]
-            by_agent = per_link.reshape(*before, self.n_agents, self._degree, *behind)
-            lead = (slice(None),) * (axis + 1)
-            total = 0.0 + by_agent[(*lead, 0)]
+            n = self.n_agents
+            lead = math.prod(before)
+            by_agent = per_link.reshape(lead, n, self._degree, math.prod(behind))
+            total = 0.0 + by_agent[:, :, 0]
             for k in range(1, self._degree):
-                total += by_agent[(*lead, k)]
-            return np.asarray(total)
+                total += by_agent[:, :, k]
+            return np.asarray(total.reshape(*before, n, *behind))
         # One sparse product over all other axes at once.
         links_first = per_link.swapaxes(axis, 0)
         shape = (self.n_agents, *links_first.shape[1:])

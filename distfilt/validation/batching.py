@@ -81,9 +81,9 @@ def call_batched(
     expected = (*x.shape[:-1], owner.dim)
     check = name_of_check(name, x)
     # The usual case: it has been checked before, and its result has the right shape.
-    has_shape = type(result) is np.ndarray and result.shape == expected
-    if has_shape and not needs_check(owner, check):
-        return result
+    is_array = isinstance(result, np.ndarray) and result.shape == expected
+    if is_array and not needs_check(owner, check):
+        return np.asarray(result)
     has_shape = getattr(result, "shape", None) == expected  # an error has no shape
     if x.ndim > 1 and x.size and (not has_shape or needs_check(owner, check)):
         _compare_with_single_state(owner, name, states, args, result)
