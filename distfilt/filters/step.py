@@ -166,19 +166,24 @@ class Step(Generic[S]):
         # Counted only with a gate.
         self.rejected: Array | None = None
         self.streaks: RejectionStreaks | None = None
-        if filter_.gate_probability is not None:
-            self.rejected = np.zeros((*self.runs, filter_.n_agents))
-            self.streaks = RejectionStreaks(self.filter, state, self.runs)
         # Added up over the observations, if they are recorded.
         self.scores: dict[str, Array] = {}
-        if filter_.record_evidence:
-            for name in ("log_likelihood", "nis", "n_observed"):
-                self.scores[name] = np.zeros((*self.runs, filter_.n_agents))
+        # Whether there is a gate, or scores of the observations.
+        has_gate = filter_.gate_probability is not None
+        self.tests_innovations = has_gate or filter_.record_evidence
+        if self.tests_innovations:
+            self._begin_tests()
 
-    @property
-    def tests_innovations(self) -> bool:
-        """Whether there is a gate, or scores of the observations."""
-        return self.rejected is not None or bool(self.scores)
+    def _begin_tests(self) -> None:
+        """Begin to count what the gate rejects, and to add up scores."""
+        f = self.filter
+        shape = (*self.runs, f.n_agents)
+        if f.gate_probability is not None:
+            self.rejected = np.zeros(shape)
+            self.streaks = RejectionStreaks(f, self.state, self.runs)
+        if f.record_evidence:
+            for name in ("log_likelihood", "nis", "n_observed"):
+                self.scores[name] = np.zeros(shape)
 
     # The beliefs -----------------------------------------------------------------------
 
