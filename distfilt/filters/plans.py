@@ -197,8 +197,9 @@ def _list_rows(
         if not fits or cast(Array, series).dtype != np.float64:
             fits = False
             break
-        numbers = np.isfinite(np.asarray(series)).reshape(grid.size, -1)
-        is_read &= numbers.all(axis=1)
+        # Each time by itself, also where there is none
+        finite = np.isfinite(np.asarray(series))
+        is_read &= finite.all(axis=tuple(range(1, finite.ndim)))
     for k, t in enumerate(grid.tolist()):
         rows = [None if series is None else series[k] for series in series_by_agent]
         if not fits or not is_read[k]:
