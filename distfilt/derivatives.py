@@ -490,7 +490,7 @@ def call_derivative(
     >>> call_derivative(lambda x: np.eye(2), (np.zeros((3, 2)),), (3, 2, 2)).shape
     (3, 2, 2)
     """
-    copies = [x.copy() if isinstance(x, np.ndarray) else x for x in args]
+    copies = [x.copy() if type(x) is np.ndarray else x for x in args]
     slope = np.asarray(call_user(derivative, *copies))
     if slope.shape == shape:
         return slope
@@ -504,7 +504,7 @@ def needs_differences(owner: HasDerivative) -> bool:
     """Whether differences are taken for an owner's derivative: in its place, or to check it."""
     if owner.derivative is None:
         return True
-    return bool(owner.is_validated and needs_check(owner, "derivative"))
+    return owner.is_validated and needs_check(owner, "derivative")
 
 
 def _is_uncertain(slope: Array, error: Array, scale: Array, tolerance: Array) -> bool:

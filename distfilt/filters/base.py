@@ -52,7 +52,7 @@ from ..validation.clocks import warn_of_clock
 from .bridge import insert_times
 from .failures import RECOVERABLE, FilterError, is_argument_error
 from .observations import Observation, match_delayed, read_observations
-from .plans import TimesArgument, find_degrees, plan_steps
+from .plans import Entries, TimesArgument, find_degrees, plan_steps
 from .priors import Prior
 from .record import (
     SCORES,
@@ -107,6 +107,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
     names: Sequence[str] = ()
 
     state_class: ClassVar[type[State]] = State
+    has_sensors: ClassVar[bool] = False
     requires_rng: ClassVar[bool] = False
     supports_runs: ClassVar[bool] = True
     batched_summary: ClassVar[bool] = False
@@ -238,6 +239,11 @@ class Filter(FrozenModel, ABC, Generic[S]):
     def summarize(self, state: S) -> Summary:
         """Return estimates and variances of a state."""
 
+    @cached_property
+    def reads_by_default(self) -> bool:
+        """Whether observations are read as those of sensors are, so that a run can plan it."""
+        return False
+
     def channel(self, state: S, t: float) -> Channel | None:
         """Return the channel of the step to `t`; None where nobody can send."""
         return None
@@ -344,12 +350,15 @@ class Filter(FrozenModel, ABC, Generic[S]):
         *,
         reuse_rng: bool = False,
         is_single: bool = False,
+        are_read: bool = False,
     ) -> S:
         """Take one step from checked arguments; a single one is not part of a planned run."""
-        # `failed` of a SensorState has one entry for each run.
-        runs = state.failed.shape if isinstance(state, SensorState) else state.runs
-        read = self.read_observations(observations, runs, t)
-        sensor_filter = self if isinstance(self, SensorFilter) else None
+        read: Any = observations
+        if not are_read:
+            # `failed` of a SensorState has one entry for each run.
+            runs = state.failed.shape if isinstance(state, SensorState) else state.runs
+            read = self.read_observations(observations, runs, t)
+        sensor_filter = cast("SensorFilter[S]", self) if self.has_sensors else None
         matched: Sequence[Observation] = ()
         if delayed:
             moved = insert_times(self, delayed, state, t, reuse_rng=reuse_rng)
@@ -420,7 +429,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         self,
         state: S,
         grid: Array,
-        entries: Iterable[Sequence[object]],
+        entries: Iterable[Entries],
         delayed: Sequence[Observation],
         *,
         reuse_rng: bool,
@@ -438,13 +447,20 @@ class Filter(FrozenModel, ABC, Generic[S]):
         # In order of arrival; those with the same arrival keep the user's order.
         waiting = sorted(delayed, key=_arrival_time)
         is_own = False
-        for t, observed in zip(grid.tolist(), entries, strict=True):
+        for t, (observed, are_read) in zip(grid.tolist(), entries, strict=True):
             arrived: list[Observation] = []
             while waiting and _arrival_time(waiting[0]) <= t:
                 arrived.append(waiting.pop(0))
             # The generator runs after the validated call that made it has returned.
             with skip_validation():
-                state = self._advance(state, t, observed, arrived, reuse_rng=is_own)
+                state = self._advance(
+                    state,
+                    t,
+                    observed,
+                    arrived,
+                    reuse_rng=is_own,
+                    are_read=are_read,
+                )
             # The first state is the user's; the others, and their generator, are the run's.
             is_own = reuse_rng
             yield state
@@ -583,6 +599,7 @@ class SensorFilter(Filter[S]):
     _: KW_ONLY
     gate_probability: Annotated[float, Bounds(above=0, below=1)] | None = None
 
+    has_sensors: ClassVar[bool] = True
     supports_increments: ClassVar[bool] = False
     supports_likelihoods: ClassVar[bool] = False
     supports_agent_models: ClassVar[bool] = False
@@ -709,6 +726,11 @@ class SensorFilter(Filter[S]):
         return tuple([s[0].dim if len(s) == 1 else None for s in self.agent_sensors])
 
     @cached_property
+    def reads_by_default(self) -> bool:
+        """Whether no subclass reads observations in its own way."""
+        return type(self).read_observations is SensorFilter.read_observations
+
+    @cached_property
     def sends_observations(self) -> bool:
         """Whether agents send their observations to their neighbours."""
         return self.graph is not None and self.share_observations
@@ -830,9 +852,10 @@ class SensorFilter(Filter[S]):
                 result.append([])
                 continue
             if type(entry) is list:
-                if not all([self._fits(o, agent, runs, t) for o in entry]):
-                    return read_observations(self, observations, runs, t)
-                result.append(list(entry))
+                for o in entry:
+                    if not self._fits(o, agent, runs, t):
+                        return read_observations(self, observations, runs, t)
+                result.append(entry.copy())
                 continue
             if (
                 type(entry) is not np.ndarray

@@ -135,7 +135,8 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
         else:
             total = self._total(step, branch, covs, own)
             new = self._solve(step, branch, covs, total)
-        return self._end(step, *new)
+        means, covs = new
+        return self._end(step, means, symmetrise(covs))
 
     @property
     def _omega(self) -> float:
@@ -204,8 +205,7 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
         rows = group.rows
         mean = means[..., rows, :]
         cov = covs[..., rows, :, :]
-        group, predicted, slope, extra = self._predict(mean, cov, group, step)
-        innovation = group.target - predicted
+        group, innovation, slope, extra = self._innovate(mean, cov, group, step)
         missing = np.isnan(innovation)
         # A missing component has a row of zeros, and a unit variance of its own.
         slope = np.where(missing[..., None], 0.0, slope)

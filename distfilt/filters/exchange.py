@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -17,7 +18,6 @@ from ..network.channel import Payload
 from ..sensors import Sensor
 from ..validation import (
     Array,
-    Indices,
     call_user,
     check_array,
     format_number,
@@ -236,7 +236,7 @@ def fuse_beliefs(step: Step[AnyState], values: tuple[Array, ...]) -> tuple[Array
         # A failed run's values may make the rule fail again, so those of a good run stand in.
         good = tuple(np.argwhere(~step.failed)[0])
         inputs = [step.keep_failed(v, v[good]) for v in inputs]
-    run_numbers = np.arange(math.prod(step.runs)).reshape(step.runs)
+    run_numbers = _number_runs(step.runs)
     channel = step.channel
     ledger = channel.ledger
     # The channels of the attempts that went through, each with the same ledger before.
@@ -246,19 +246,27 @@ def fuse_beliefs(step: Step[AnyState], values: tuple[Array, ...]) -> tuple[Array
         *beliefs, numbers, _, _ = arrays
         attempt = channel.for_run(numbers.astype(np.intp), ledger)
         # A rule of a family that fuses in a step is a function.
-        rule = cast(Callable[..., object], step.filter.fusion)
+        rule = cast("Callable[..., object]", step.filter.fusion)
         results = _apply_rule(rule, beliefs, attempt)
         used.append(attempt)
         return results
 
     # All runs at once, and one by one if that fails.
-    results = step.apply(fuse_runs, (*inputs, run_numbers.astype(float)), values)
+    results = step.apply(fuse_runs, (*inputs, run_numbers), values)
     if used:
         step.channel = _merge_channels(channel, used, run_numbers)
     if not step.any_failed:
         return results
     pairs = zip(results, values, strict=True)
     return tuple([step.keep_failed(new, old) for new, old in pairs])
+
+
+@lru_cache(maxsize=16)
+def _number_runs(runs: tuple[int, ...]) -> Array:
+    """Return the numbers of the runs of a batch, as floats, read-only."""
+    numbers = np.arange(math.prod(runs), dtype=np.float64).reshape(runs)
+    numbers.setflags(write=False)
+    return numbers
 
 
 def _apply_rule(
@@ -279,7 +287,7 @@ def _apply_rule(
         # Mostly it is an array that fits: then nothing has to be converted.
         if type(new) is np.ndarray and new.dtype == np.float64:
             fits = new.shape == old.shape
-            if fits and np.count_nonzero(np.isfinite(new)) == new.size:
+            if fits and math.isfinite(np.vdot(new, new)):
                 checked.append(new)
                 continue
         checked.append(check_array(new, "fusion", old.shape))
@@ -287,7 +295,7 @@ def _apply_rule(
 
 
 def _merge_channels(
-    before: Channel, used: list[Channel], run_numbers: Indices
+    before: Channel, used: list[Channel], run_numbers: Array
 ) -> Channel:
     """Return the channel whose ledger counts the fusion once.
 
@@ -298,4 +306,5 @@ def _merge_channels(
     if for_batch:
         return for_batch[-1]
     lost = np.mean([channel.ledger.lost for channel in used], axis=0)
-    return before.for_run(run_numbers, used[-1].ledger.replace(lost=lost))
+    ledger = used[-1].ledger.replace(lost=lost)
+    return before.for_run(run_numbers.astype(np.intp), ledger)

@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 
 from ..derivatives import needs_differences
-from ..gaussians.single import condition, unscented_points
+from ..gaussians.single import condition, condition_complete, unscented_points
 from ..linalg import (
     EPS,
     cholesky,
@@ -114,11 +114,13 @@ class GaussianState(SensorState):
     @property
     def means(self) -> Array:
         """Means of the present state, (*runs, A, d)."""
-        return self.joint_means[..., : self.dim]
+        return self.joint_means[..., : self.dim] if self.history else self.joint_means
 
     @property
     def covariances(self) -> Array:
         """Covariances of the present state, (*runs, A, d, d)."""
+        if not self.history:
+            return self.joint_covariances
         return self.joint_covariances[..., : self.dim, : self.dim]
 
 
@@ -182,36 +184,43 @@ class GaussianFamily(
         RuntimeWarning
             If a standard deviation after the fusion is below the rounding of its mean.
         """
-        means, covs = self._assimilate(step)
+        means, covs = self._check_forecast(step)
+        # Joseph's form leaves symmetric covariances, a forecast does so up to rounding.
+        is_symmetric = False
+        for place, group in step.received():
+            means, covs = self._condition(means, covs, place, group, step)
+            is_symmetric = is_symmetric or len(group.agents) == self.n_agents
+        # A run that failed here needs a covariance with a Cholesky factor in the fusion.
+        covs = step.keep_failed(covs, identity(means.shape[-1]))
         if step.has_fusion:
             means, covs = self._fuse(means, covs, step)
+            is_symmetric = False
+        if not is_symmetric or step.any_failed:
+            covs = symmetrise(covs)
         return self._end(step, means, covs)
-
-    def _assimilate(self, step: Step[GaussianState]) -> tuple[Array, Array]:
-        """Return the joint moments after the forecast and the received observations."""
-        means, covs = self._check_forecast(step)
-        for place, group in step.received():
-            self._condition(means, covs, place, group, step)
-        # A run that failed here needs a covariance with a Cholesky factor in the fusion.
-        return means, step.keep_failed(covs, identity(means.shape[-1]))
 
     def _check_forecast(self, step: Step[GaussianState]) -> tuple[Array, Array]:
         """Return the forecast's joint moments; failed runs get a harmless Gaussian."""
         means, covs = self._forecast(step)
+        if all_finite(means) and all_finite(covs) and not step.any_failed:
+            return means, covs
         means = step.check_forecast(means, 0.0)
         return means, step.check_forecast(covs, identity(means.shape[-1]))
 
     def _end(
         self, step: Step[GaussianState], means: Array, covs: Array, **fields: Array
     ) -> GaussianState:
-        """Return the state after the step with these joint moments, and a family's own fields."""
+        """Return the state after the step with these joint moments, and a family's own fields.
+
+        The covariances are symmetric to the last digit.
+        """
         if self.periods:
             # The mean of each time by itself: a covariance does not depend on the branch.
             n_times = means.shape[-1] // self.model.dim
             means = wrap_differences(means, self.periods * n_times)
         return step.end(
             joint_means=means,
-            joint_covariances=symmetrise(covs),
+            joint_covariances=covs,
             dim=step.state.dim,
             history=step.times[::-1],
             **fields,
@@ -231,7 +240,9 @@ class GaussianFamily(
         if not dt:
             return state.joint_means.copy(), state.joint_covariances.copy()
         d = state.dim
-        if self.periods or self.notices_wrapping:
+        # A single point cannot lie on both sides of a cut.
+        has_points = self.linearization == "unscented"
+        if self.periods or (self.notices_wrapping and has_points):
             move = partial(self._step_points, step)
         else:
             move = partial(model.step, t=state.t, dt=dt)
@@ -251,13 +262,18 @@ class GaussianFamily(
             noise = model.Q(state.t, dt)
         if extra is not None:
             noise = noise + extra
-        cov = slope @ old[..., :d, :d] @ slope.mT + noise
+        cov = slope @ state.covariances @ slope.mT + noise
         size = len(step.times) * d
         if size:
             # The past keeps its covariance; its cross-covariance with the present becomes F P.
             mean = np.concatenate([mean, state.joint_means[..., :size]], axis=-1)
             cross = slope @ old[..., :d, :size]
-            cov = np.block([[cov, cross], [cross.mT, old[..., :size, :size]]])
+            joint = np.empty((*mean.shape, d + size))
+            joint[..., :d, :d] = cov
+            joint[..., :d, d:] = cross
+            joint[..., d:, :d] = cross.mT
+            joint[..., d:, d:] = old[..., :size, :size]
+            cov = joint
         if self.inflation != 1.0:
             # Rows and columns of the present, so that its own block gets the square.
             cov[..., :d, :] *= self.inflation
@@ -329,20 +345,25 @@ class GaussianFamily(
         place: int,
         group: Received,
         step: Step[GaussianState],
-    ) -> None:
-        """Condition a group's joint Gaussians on its observations, in place."""
+    ) -> tuple[Array, Array]:
+        """Return all joint moments with a group's conditioned on its observations."""
         d = self.model.dim
         rows = group.rows
-        # The latest time comes first in the joint state, and last among the places.
-        first = (len(step.times) - place) * d
-        block = slice(first, first + d)
-        joint_mean = means[..., rows, :]
-        joint_cov = covs[..., rows, :, :]
-        mean = joint_mean[..., block]
-        cov = joint_cov[..., block, block]
-        group, predicted, slope, extra = self._predict(mean, cov, group, step)
-        # r = y* - h(m); NaN where a component is missing, which `condition` leaves out.
-        innovation = group.target - predicted
+        is_part = len(group.agents) < means.shape[-2]
+        joint_mean = means
+        joint_cov = covs
+        if is_part:
+            joint_mean = means[..., rows, :]
+            joint_cov = covs[..., rows, :, :]
+        mean = joint_mean
+        cov = joint_cov
+        if mean.shape[-1] > d:
+            # The latest time comes first in the joint state, and last among the places.
+            first = (len(step.times) - place) * d
+            block = slice(first, first + d)
+            mean = joint_mean[..., block]
+            cov = joint_cov[..., block, block]
+        group, innovation, slope, extra = self._innovate(mean, cov, group, step)
         if self.iterations > 1 and not group.linear:
             innovation, slope = self._relinearize(
                 mean, cov, innovation, slope, group, step
@@ -356,13 +377,22 @@ class GaussianFamily(
         if extra is not None:
             # S = H P Hᵀ + R, where the extra covariance of the unscented points counts as noise.
             arrays = (*arrays, group.noise + extra)
-        means[..., rows, :], covs[..., rows, :, :] = step.apply(
-            _condition_rows,
+        is_complete = all_finite(innovation)
+        new_mean, new_cov = step.apply(
+            _condition_complete_rows if is_complete else _condition_rows,
             arrays,
             (joint_mean, joint_cov),
             group.agents,
             shared=group.noise,
         )
+        if not is_part:
+            return new_mean, new_cov
+        # Copies: the forecast's mean may be an array that the model keeps.
+        means = means.copy()
+        covs = covs.copy()
+        means[..., rows, :] = new_mean
+        covs[..., rows, :, :] = new_cov
+        return means, covs
 
     def _relinearize(
         self,
@@ -399,33 +429,44 @@ class GaussianFamily(
             slope = np.where(is_blind[..., None], slope, new_slope)
         return innovation, slope
 
-    def _predict(
+    def _innovate(
         self, mean: Array, cov: Array, group: Received, step: Step[GaussianState]
     ) -> tuple[Received, Array, Array, Array | None]:
-        """Predict a group's observations by Gaussians (*runs, G, d) of their time.
+        """Compare a group's observations with predictions by Gaussians (*runs, G, d).
 
-        Returns the group without the observations that the gate rejects, the predictions, NaN
-        where the sensor cannot see, their slope, and their extra covariance, if any.
+        Returns the group without the observations that the gate rejects, and the innovations
+        r = y - h(m), NaN where a number is missing or the sensor cannot see it. Behind them come
+        the slope of the predictions, and their extra covariance, if any.
         """
-        linear = group.linear
-        predict = partial(group.predict, branch="first")
         predicted, slope, extra = self._linearize(
-            predict, group.jacobian, mean, cov, linear
+            partial(group.predict, branch="first"),
+            group.jacobian,
+            mean,
+            cov,
+            group.linear,
         )
-        if not linear:
+        innovation = group.target - predicted
+        is_complete = all_finite(innovation)
+        if not group.linear:
             # Mostly everything is seen, and each number depends on the state: 0 < Σ H² < ∞.
             steepness = np.vecdot(slope, slope)
             is_steep = np.count_nonzero(steepness) == steepness.size
-            if not (is_steep and all_finite(steepness) and all_finite(predicted)):
+            if not (is_steep and all_finite(steepness) and is_complete):
                 predicted = self._leave_out_unseen(predicted, slope, group, step)
+                innovation = group.target - predicted
 
-        def moments(_: Array) -> tuple[Array, Array]:
-            """Return the moments of the prediction, which lie on one branch."""
-            predicted_cov = slope @ cov @ slope.mT
-            return predicted, predicted_cov if extra is None else predicted_cov + extra
+        if step.tests_innovations:
 
-        group = step.gate(group, moments, predicted[..., None, :])
-        return group, predicted, slope, extra
+            def moments(_: Array) -> tuple[Array, Array]:
+                """Return the moments of the prediction, which lie on one branch."""
+                predicted_cov = slope @ cov @ slope.mT
+                if extra is not None:
+                    predicted_cov = predicted_cov + extra
+                return predicted, predicted_cov
+
+            group = step.gate(group, moments, predicted[..., None, :])
+            innovation = group.target - predicted
+        return group, innovation, slope, extra
 
     def _leave_out_unseen(
         self,
@@ -476,22 +517,10 @@ class GaussianFamily(
         common = fold(mean, self.periods) if self.periods else mean
         fused_mean, fused_cov = step.fuse(common, cov)
         fused_mean = fused_mean + (mean - common) if self.periods else fused_mean
-        variance = np.diagonal(fused_cov, axis1=-2, axis2=-1)
-        # A variance that is negative by rounding alone is small beside the largest one.
-        smallest = variance.min()
-        if smallest < 0 and smallest < -1e-9 * np.abs(variance).max():
-            raise ValueError(
-                f"fusion must return a covariance, got a variance of {variance.min():g}"
-            )
-        # A variance below (ε m)² cannot come from independent information.
-        if ((variance > 0) & (variance < (EPS * fused_mean) ** 2)).any():
-            warnings.warn(
-                "covariance after fusion is below rounding at t = "
-                f"{format_number(step.t)} s: "
-                "information is probably counted twice",
-                RuntimeWarning,
-                4,
-            )
+        variance = fused_cov.diagonal(axis1=-2, axis2=-1)
+        # Mostly no variance is negative, or below the rounding of its mean.
+        if np.count_nonzero(variance < (EPS * fused_mean) ** 2):
+            _check_fused(fused_mean, variance, step.t)
         if means.shape[-1] == d:
             return fused_mean, fused_cov
         # With the gain G = P_joint,now P_now⁻¹: m + G Δm and P + G ΔP Gᵀ.
@@ -569,6 +598,24 @@ class GaussianFilter(
         return insert_gaussian(self, state, t)
 
 
+def _check_fused(mean: Array, variance: Array, t: float) -> None:
+    """Refuse negative variances after a fusion, and warn of those below rounding."""
+    # A variance that is negative by rounding alone is small beside the largest one.
+    smallest = variance.min()
+    if smallest < -1e-9 * np.abs(variance).max():
+        raise ValueError(
+            f"fusion must return a covariance, got a variance of {smallest:g}"
+        )
+    # A variance below (ε m)² cannot come from independent information.
+    if ((variance > 0) & (variance < (EPS * mean) ** 2)).any():
+        warnings.warn(
+            f"covariance after fusion is below rounding at t = {format_number(t)} s: "
+            "information is probably counted twice",
+            RuntimeWarning,
+            5,
+        )
+
+
 def _factor_covariance(cov: Array) -> tuple[Array, Array]:
     """Return the lower factor of covariances, and one with an inverse.
 
@@ -600,6 +647,17 @@ def _fill_zero_columns(root: Array) -> Array:
     if not np.count_nonzero(is_zero):
         return root
     return np.asarray(root + np.where(is_zero[..., None], np.eye(root.shape[-1]), 0.0))
+
+
+def _condition_complete_rows(
+    mean: Array,
+    cov: Array,
+    innovation: Array,
+    slope: Array,
+    noise: Array,
+    *_: object,
+) -> tuple[Array, Array]:
+    return condition_complete(mean, cov, innovation, slope, noise)
 
 
 def _condition_rows(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,9 +33,20 @@ Series = Sequence[object] | NDArray[np.generic]
 """The observations of an agent, one entry for each time."""
 
 
+class Entries(NamedTuple):
+    """The observations of one time of a run, an entry for each agent.
+
+    They have been read if each agent has a list of Observations that fit its sensors, with
+    finite values: then a step need not look at them again.
+    """
+
+    observations: Sequence[Any]
+    are_read: bool
+
+
 def plan_steps(
     f: Filter[AnyState], state: AnyState, times: TimesArgument, observations: object
-) -> tuple[Array, Iterator[Sequence[object]]]:
+) -> tuple[Array, Iterator[Entries]]:
     """Return the times of a run's steps, and an iterator over the observations of each.
 
     >>> from distfilt.filters import GaussianFilter
@@ -50,7 +61,7 @@ def plan_steps(
     ...     Observation(1.0, 0, [1.0]),
     ... ]
     >>> times, entries = plan_steps(f, f.start((np.zeros(4), np.eye(4))), None, events)
-    >>> times, [[float(o.value[0]) for o in agent] for (agent,) in entries]
+    >>> times, [[float(o.value[0]) for o in e.observations[0]] for e in entries]
     (array([0.5, 1. ]), [[3.0], [2.0, 1.0]])
     """
     # With events the grid may be empty: their own times are enough.
@@ -58,13 +69,13 @@ def plan_steps(
     check_increasing(grid, "times")
     # An empty list has no entry for any agent, so it can only be one without events.
     if are_observations(observations):
-        grid, entries = _plan_events(f, grid, observations)
+        grid, entries = _plan_events(f, state, grid, observations)
     elif times is None:
         raise ValueError(
             "times must be an array unless all observations are Observations, got None"
         )
     else:
-        entries = _plan_series(f, grid, observations)
+        entries = _plan_series(f, state, grid, observations)
     if grid.size and grid[0] < state.t:
         raise ValueError(
             f"times must start at the state's time {format_number(state.t)} or later, got "
@@ -75,8 +86,11 @@ def plan_steps(
 
 
 def _plan_events(
-    f: Filter[AnyState], grid: Array, events: Sequence[Observation]
-) -> tuple[Array, Iterator[Sequence[object]]]:
+    f: Filter[AnyState],
+    state: AnyState,
+    grid: Array,
+    events: Sequence[Observation],
+) -> tuple[Array, Iterator[Entries]]:
     """Sort events by time; there is a step at each time of the grid and of an event."""
     by_time: dict[float, list[list[Observation]]] = {}
     for t in grid:
@@ -93,13 +107,51 @@ def _plan_events(
     wild = find_degrees(_sensors_of(f), events)
     if wild is not None:
         warnings.warn(wild, RuntimeWarning, stacklevel=5)
-    times = np.array(sorted(by_time))
-    return times, iter([by_time[t] for t in times])
+    times = sorted(by_time)
+    # What does not fit is looked at again, and refused or completed, in its step.
+    unread = {*times}
+    if f.reads_by_default:
+        unread = {e.t for e in _find_unfit(_sensors_of(f), _runs_of(state), events)}
+    entries = [Entries(by_time[t], t not in unread) for t in times]
+    return np.array(times), iter(entries)
+
+
+def _find_unfit(
+    agent_sensors: SensorLists, runs: tuple[int, ...], events: Sequence[Observation]
+) -> list[Observation]:
+    """Return the events that are not complete observations by one of their agent's sensors."""
+    unfit: list[Observation] = []
+    fitting: dict[int, list[Observation]] = {}
+    for event in events:
+        number = event.sensor
+        sensors = agent_sensors[event.agent]
+        expected: tuple[int, ...] | None = None
+        # One that arrives later is looked at again.
+        is_punctual = event.arrival_time is None
+        if is_punctual and isinstance(number, int) and number < len(sensors):
+            expected = (*runs, sensors[number].dim)
+        if event.value.shape != expected:
+            unfit.append(event)
+        else:
+            fitting.setdefault(event.value.size, []).append(event)
+    for same_size in fitting.values():
+        # All values of one size at once
+        values = np.array([event.value.ravel() for event in same_size])
+        is_finite = np.isfinite(values).all(axis=1).tolist()
+        pairs = zip(same_size, is_finite, strict=True)
+        unfit += [event for event, is_good in pairs if not is_good]
+    return unfit
+
+
+def _runs_of(state: AnyState) -> tuple[int, ...]:
+    """Return the runs of a state; of agents with sensors those that may fail one by one."""
+    failed = getattr(state, "failed", None)
+    return state.runs if failed is None else failed.shape
 
 
 def _plan_series(
-    f: Filter[AnyState], grid: Array, observations: object
-) -> Iterator[Sequence[object]]:
+    f: Filter[AnyState], state: AnyState, grid: Array, observations: object
+) -> Iterator[Entries]:
     """Take each agent's series (T, ...) apart into times."""
     series_by_agent: list[Series | None] = []
     for series in list_by_agent(observations, f.n_agents):
@@ -119,10 +171,45 @@ def _plan_series(
             _check_series(sensors[agent], series, agent)
         if series is not None and sensors:
             _warn_of_degrees(sensors, series, agent)
-    return (
-        [None if series is None else series[k] for series in series_by_agent]
-        for k in range(grid.size)
-    )
+    shapes: list[tuple[int, ...] | None] = []
+    if f.reads_by_default:
+        lead = (grid.size, *_runs_of(state))
+        shapes = [(*lead, s[0].dim) if len(s) == 1 else None for s in sensors]
+    return _list_rows(grid, series_by_agent, shapes)
+
+
+def _list_rows(
+    grid: Array,
+    series_by_agent: list[Series | None],
+    shapes: list[tuple[int, ...] | None],
+) -> Iterator[Entries]:
+    """Yield the rows of all agents' series time by time.
+
+    Arrays of these shapes are read, where all of their numbers are finite: those of agents with
+    one sensor each.
+    """
+    is_read = np.ones(grid.size, dtype=bool)
+    fits = bool(shapes)
+    for series, shape in zip(series_by_agent, shapes, strict=bool(shapes)):
+        if series is None:
+            continue
+        fits = fits and isinstance(series, np.ndarray) and series.shape == shape
+        if not fits or cast(Array, series).dtype != np.float64:
+            fits = False
+            break
+        # Each time by itself, also where there is none
+        finite = np.isfinite(np.asarray(series))
+        is_read &= finite.all(axis=tuple(range(1, finite.ndim)))
+    for k, t in enumerate(grid.tolist()):
+        rows = [None if series is None else series[k] for series in series_by_agent]
+        if not fits or not is_read[k]:
+            yield Entries(rows, False)
+            continue
+        read = [
+            [] if row is None else [Observation.construct(t, agent, row)]
+            for agent, row in enumerate(rows)
+        ]
+        yield Entries(read, True)
 
 
 def _sensors_of(f: Filter[AnyState]) -> SensorLists:
@@ -198,15 +285,17 @@ def find_degrees(
             if sensor >= len(sensors):
                 continue
             sensor = sensors[sensor]
-        # Angles below four turns need no closer look.
-        value = np.asarray(observation.value, dtype=np.float64)
-        is_large = sensor.wraps and np.nan_to_num(np.abs(value)).max(initial=0.0) > 25
-        if is_large and value.shape[-1:] == (sensor.dim,):
+        if not sensor.wraps:
+            continue
+        value = observation.value
+        if value.shape[-1:] == (sensor.dim,):
             values.setdefault((observation.agent, sensor), []).append(value)
     for (agent, sensor), parts in values.items():
         observed = np.concatenate([v.reshape(-1, sensor.dim) for v in parts])
         observed = np.nan_to_num(observed)
-        turns = _count_turns(sensor, observed)
+        # Angles below four turns need no closer look.
+        large = observed[(np.abs(observed) > 25).any(axis=-1)]
+        turns = _count_turns(sensor, large) if large.size else 0.0
         if turns > 4:
             return (
                 f"observations[{agent}] must be angles in rad, got some {turns:.0f} turns off "

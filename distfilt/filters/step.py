@@ -11,14 +11,14 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from types import EllipsisType
 from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..derivatives import needs_differences
+from ..derivatives import call_derivative, needs_differences
 from ..linalg import cholesky, deviations, log_det, quadratic_form
 from ..models import Model
 from ..periods import check_sensor, gather
@@ -144,14 +144,17 @@ class Step(Generic[S]):
             self.rng = copy_rng(state.rng)
         self.failed: Mask = getattr(state, "failed", _NO_RUNS)
         self.runs: tuple[int, ...] = self.failed.shape
-        self.any_failed = bool(np.count_nonzero(self.failed))
+        self.any_failed = bool(np.any(self.failed) if self.runs else self.failed)
+        # The model of the agents' states, (*runs, A, ..., d).
+        self.has_sensors = filter_.has_sensors
+        if self.has_sensors:
+            self.model = self.filter.model_of_states(self.runs)
         # Whether there is a fusion rule, and a channel to use it.
         self.has_fusion = filter_.fusion is not None and self.channel is not None
         self.pending: tuple[Observation, ...] = ()
         # How many observations cannot be seen from a belief, if there are any.
         self.unseen: Array | None = None
         self.warned: tuple[str, ...] = state.warned
-        self.has_sensors = hasattr(filter_, "agent_sensors")
         # Sensors of changes need the beliefs about the times of their last observations.
         self.lagged = self.times
         self.references: References | None = None
@@ -163,25 +166,31 @@ class Step(Generic[S]):
         # Counted only with a gate.
         self.rejected: Array | None = None
         self.streaks: RejectionStreaks | None = None
-        if filter_.gate_probability is not None:
-            self.rejected = np.zeros((*self.runs, filter_.n_agents))
-            self.streaks = RejectionStreaks(self.filter, state, self.runs)
         # Added up over the observations, if they are recorded.
         self.scores: dict[str, Array] = {}
-        if filter_.record_evidence:
-            for name in ("log_likelihood", "nis", "n_observed"):
-                self.scores[name] = np.zeros((*self.runs, filter_.n_agents))
+        # Whether there is a gate, or scores of the observations.
+        has_gate = filter_.gate_probability is not None
+        self.tests_innovations = has_gate or filter_.record_evidence
+        if self.tests_innovations:
+            self._begin_tests()
 
-    @cached_property
-    def model(self) -> Model:
-        """The model of the agents' states, (*runs, A, ..., d)."""
-        return self.filter.model_of_states(self.runs)
+    def _begin_tests(self) -> None:
+        """Begin to count what the gate rejects, and to add up scores."""
+        f = self.filter
+        shape = (*self.runs, f.n_agents)
+        if f.gate_probability is not None:
+            self.rejected = np.zeros(shape)
+            self.streaks = RejectionStreaks(f, self.state, self.runs)
+        if f.record_evidence:
+            for name in ("log_likelihood", "nis", "n_observed"):
+                self.scores[name] = np.zeros(shape)
 
     # The beliefs -----------------------------------------------------------------------
 
     def check_forecast(self, values: Array, old: Array | float) -> Array:
         """Return a finite forecast (*runs, A, ...), and `old` in failed runs."""
-        if np.count_nonzero(np.isfinite(values)) < values.size:
+        # A finite sum of squares proves that all are finite; it may overflow.
+        if not math.isfinite(np.vdot(values, values)):
             # One row for each run and agent.
             lead = len(self.runs) + 1
             errors = failures.find_nonfinite_rows(values, lead, "forecast")
@@ -249,9 +258,9 @@ class Step(Generic[S]):
             return collect_observations(self)
         # Nothing is exchanged here. A subclass may have put other agents' observations
         # into an agent's list, so a sensor is looked up at the agent that observed.
-        pairs = []
+        pairs: list[list[tuple[Sensor, Array]]] = []
         for agent, observations in enumerate(self.observations):
-            of_agent = []
+            of_agent: list[tuple[Sensor, Array]] = []
             for o in observations:
                 if self.references is not None:
                     self.references.receive(agent, o)
@@ -417,9 +426,8 @@ class Step(Generic[S]):
         """
         lead = len(self.runs) + (agents is not None)
         # The state of the generator, to draw the same numbers in a second attempt.
-        is_batch = math.prod(arrays[0].shape[:lead]) > 1
         rng_state: Mapping[str, object] | None = None
-        if rng is not None and is_batch:
+        if rng is not None and math.prod(arrays[0].shape[:lead]) > 1:
             rng_state = rng.bit_generator.state
         errors: dict[Row, str] = {}
         # The plain way: one call for the whole batch.
@@ -438,7 +446,7 @@ class Step(Generic[S]):
             )
         # A row may also fail without an error, by overflow for instance.
         for values in results:
-            if np.count_nonzero(np.isfinite(values)) < values.size:
+            if not math.isfinite(np.vdot(values, values)):
                 errors |= failures.find_nonfinite_rows(values, lead, "result")
         if errors:
             # Failed rows keep their values from before the computation.
@@ -503,7 +511,7 @@ class Step(Generic[S]):
         >>> bool(np.allclose(state.history[0][1], state.ensembles))
         True
         """
-        if not self.has_fusion or self.failed.all():
+        if not self.has_fusion or (self.any_failed and self.failed.all()):
             return values
         return fuse_beliefs(self, values)
 
@@ -523,21 +531,27 @@ class Step(Generic[S]):
         if isinstance(state, SensorState):
             if self.times or self.references is not None:
                 belief |= self._describe_past(past, belief)
-            belief["unseen"] = self.unseen
             belief["failed"] = self.failed
-            belief["pending"] = self.pending
+            # A long run keeps many states: what has its default takes no place.
+            if self.unseen is not None:
+                belief["unseen"] = self.unseen
+            if self.pending:
+                belief["pending"] = self.pending
         if self.has_sensors:
             belief["assimilated"] = self._note_assimilated()
-            belief["warned"] = self.warned
+            if self.warned:
+                belief["warned"] = self.warned
         if self.streaks is not None:
             belief["rejection_streaks"] = self.streaks.counts
+        if self.rejected is not None:
+            belief["rejected"] = self.rejected
         # The messages in the step are in the channel's ledger.
         ledger = state.ledger if self.channel is None else self.channel.ledger
         # A failed run has no score.
         for name, values in self.scores.items():
             self.scores[name] = self.keep_failed(values, np.nan)
         new: S = type(state).construct(
-            self.t, ledger, self.rng, rejected=self.rejected, **self.scores, **belief
+            self.t, ledger, self.rng, **self.scores, **belief
         )
         return new
 
@@ -568,8 +582,11 @@ class Step(Generic[S]):
             result = [entry for entry in before if entry[0] in kept_times]
         for entries in (*self.observations, self.delayed):
             for o in entries:
-                # The user may change the array before the next step.
-                result.append((o.t, o.agent, o.sensor, o.value.copy(), o.metadata))
+                # The user may change the array before the next step, unless it is a frozen copy.
+                flags = o.value.flags
+                is_frozen = flags.owndata and not flags.writeable
+                value = o.value if is_frozen else o.value.copy()
+                result.append((o.t, o.agent, o.sensor, value, o.metadata))
         return tuple(result)
 
     # What is said once ----------------------------------------------------------------
@@ -654,7 +671,7 @@ class Received:
     target: Array
 
     def __init__(
-        self, agents: list[int], sensors: Sequence[tuple[Sensor, ...]]
+        self, agents: list[int], sensors: Mapping[int, tuple[Sensor, ...]]
     ) -> None:
         self.agents = np.array(agents, dtype=np.intp)
         # A slice gives views, where a list of numbers copies.
@@ -673,6 +690,8 @@ class Received:
                 self.sensor_index[g, start : start + sensor.dim] = k
                 start += sensor.dim
         self.parts = [self._make_part(*item) for item in starts.items()]
+        # Sensors whose derivative is made by differences, or not yet compared with them.
+        self._differenced = [part.sensor for part in self.parts]
         self.noise = self._assemble_noise(starts)
         self.linear = all(sensor.linear is not None for sensor in starts)
         self.changes = any(sensor.uses_previous for sensor in starts)
@@ -892,7 +911,7 @@ class Received:
                 values = self._predict_part(part, of_agents, before, branch)
                 rows[(..., *part.cells, slice(None))] = values.swapaxes(-1, -2)
             result = np.ascontiguousarray(rows.swapaxes(-1, -2))
-        if np.count_nonzero(np.isinf(result)):
+        if not math.isfinite(np.vdot(result, result)) and np.isinf(result).any():
             raise ValueError(
                 "predicted must have finite numbers or NaN (missing), got infinity"
             )
@@ -962,7 +981,7 @@ class Received:
             check = name_of_check("h", states)
             if not sensor.uses_previous and not needs_check(sensor, check):
                 self._checked.add((sensor, is_single))
-        if self.wraps and sensor.wraps and branch != "each":
+        if sensor.wraps and branch != "each" and states.shape[-2] > 1:
             return _gather_predictions(sensor, values, states, previous)
         return values
 
@@ -992,12 +1011,19 @@ class Received:
         if self.linear:
             return np.full((*self.target.shape, d), self.H(d))
         std = None
-        if cov is not None and any(
-            [needs_differences(part.sensor) for part in self.parts]
-        ):
-            std = deviations(cov)
+        if self._differenced:
+            # In place: all groups of the pattern have the same list.
+            remaining = [s for s in self._differenced if needs_differences(s)]
+            self._differenced[:] = remaining
+            if cov is not None and remaining:
+                std = deviations(cov)
         if self.has_one_part:
-            return self.parts[0].sensor.jacobian(states, std=std)
+            sensor = self.parts[0].sensor
+            if self._differenced or sensor.derivative is None or self.changes:
+                return sensor.jacobian(states, std=std)
+            return call_derivative(
+                sensor.derivative, (states,), (*self.target.shape, d)
+            )
         result = np.empty((*self.target.shape, d))
         for part in self.parts:
             # H of the sensor's agents, (*runs, agents, m, d)
@@ -1098,26 +1124,30 @@ def _gather_predictions(
     return gather(values, sensor.bring_near, tangent, fallback)
 
 
+_Pattern = tuple[tuple[int, tuple[Sensor, ...]], ...]
+"""Which agents have observations, and of which sensors."""
+
+
 @lru_cache(maxsize=1024)
-def _plan_few(pattern: tuple[tuple[Sensor, ...], ...]) -> list[Received]:
+def _plan_few(pattern: _Pattern) -> list[Received]:
     """Plan the groups of a few agents, of whose events many patterns recur."""
     return _plan_groups(pattern)
 
 
 @lru_cache(maxsize=32)
-def _plan_many(pattern: tuple[tuple[Sensor, ...], ...]) -> list[Received]:
+def _plan_many(pattern: _Pattern) -> list[Received]:
     """Plan the groups of many agents, whose plans are large."""
     return _plan_groups(pattern)
 
 
-def _plan_groups(pattern: tuple[tuple[Sensor, ...], ...]) -> list[Received]:
-    """Plan a group for each number of values that occurs; agents without any are left out."""
+def _plan_groups(pattern: _Pattern) -> list[Received]:
+    """Plan a group for each number of values that occurs."""
     agents_by_size: dict[int, list[int]] = {}
-    for agent, sensors in enumerate(pattern):
-        if sensors:
-            size = sum(sensor.dim for sensor in sensors)
-            agents_by_size.setdefault(size, []).append(agent)
-    return [Received(agents, pattern) for _, agents in sorted(agents_by_size.items())]
+    for agent, sensors in pattern:
+        size = sum(sensor.dim for sensor in sensors)
+        agents_by_size.setdefault(size, []).append(agent)
+    by_agent = dict(pattern)
+    return [Received(agents, by_agent) for _, agents in sorted(agents_by_size.items())]
 
 
 def group_agents(
@@ -1130,9 +1160,15 @@ def group_agents(
     >>> group_agents([[], []])
     []
     """
-    # The pattern of sensors is the key of the plan.
-    pattern = tuple([tuple([s for s, _ in pairs]) for pairs in observations])
-    plans = _plan_few(pattern) if len(pattern) <= _FEW else _plan_many(pattern)
+    # The pattern of sensors is the key of the plan; agents without any are left out.
+    pattern = tuple(
+        [
+            (agent, tuple([sensor for sensor, _ in pairs]))
+            for agent, pairs in enumerate(observations)
+            if pairs
+        ]
+    )
+    plans = _plan_few(pattern) if len(observations) <= _FEW else _plan_many(pattern)
     groups = []
     for plan in plans:
         values = [v for agent in plan.agents.tolist() for _, v in observations[agent]]

@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar, cast
 
 import numpy as np
 
+from ..linalg import symmetrise
 from ..network import Graph, fuse_on_tree
 from ..validation import Array, Rng, check_positive_definite
 from .gaussian import GaussianFamily, GaussianState
@@ -139,11 +140,10 @@ class ChannelFilter(GaussianFamily):
         together.state = self._join_links(step.state)
         all_means, all_covs = self._forecast(together)
         unit = np.eye(self.model.dim)
-        # Copies, in which groups of agents are updated in place
-        means = step.check_forecast(all_means[..., :n, :].copy(), 0.0)
-        covs = step.check_forecast(all_covs[..., :n, :, :].copy(), unit)
+        means = step.check_forecast(all_means[..., :n, :], 0.0)
+        covs = step.check_forecast(all_covs[..., :n, :, :], unit)
         for place, group in step.received():
-            self._condition(means, covs, place, group, step)
+            means, covs = self._condition(means, covs, place, group, step)
         # A run that has failed gets harmless Gaussians, so that the batch can go on.
         covs = step.keep_failed(covs, unit)
         link_means = step.keep_failed(all_means[..., n:, :], 0.0)
@@ -156,7 +156,11 @@ class ChannelFilter(GaussianFamily):
             means, covs = belief
             link_means, link_covs = common
         return self._end(
-            step, means, covs, link_means=link_means, link_covariances=link_covs
+            step,
+            means,
+            symmetrise(covs),
+            link_means=link_means,
+            link_covariances=link_covs,
         )
 
     def _join_links(

@@ -99,11 +99,29 @@ def condition(
     >>> x, p
     (array([1.]), array([[0.5]]))
     """
-    missing = None if all_finite(innovation) else np.isnan(innovation)
-    if missing is not None:
+    missing = None
+    if not all_finite(innovation):
+        missing = np.isnan(innovation)
         # The row of H may be NaN too, where the component cannot be predicted.
         H = np.where(missing[..., None], 0.0, H)
         innovation = np.where(missing, 0.0, innovation)
+    return condition_complete(mean, cov, innovation, H, R, missing)
+
+
+def condition_complete(
+    mean: Array,
+    cov: Array,
+    innovation: Array,
+    H: Array,
+    R: Array,
+    missing: Mask | None = None,
+) -> tuple[Array, Array]:
+    """Condition Gaussians unchecked, by innovations that are zero where one is missing.
+
+    >>> one = np.ones((1, 1))
+    >>> condition_complete(np.zeros(1), one, np.array([2.0]), one, one)
+    (array([1.]), array([[0.5]]))
+    """
     cross, innovation_cov = innovation_moments(cov, H, R, missing)
     # K = P Hᵀ S⁻¹, by a solve instead of an inverse.
     gain = solve_definite(innovation_cov, cross).mT

@@ -38,10 +38,15 @@ from ..validation import (
     is_first_use,
     validated,
 )
+from ..validation.checks import all_finite, is_nonnegative_diagonal
 from ..validation.clocks import warn_of_clock
+from ..validation.decorators import is_of_library
 
 __all__ = ["LinearModel", "Model", "simulate"]
 
+
+_SMALL = 8
+"""Covariances up to this size are looked up among those that have been checked."""
 
 NoiseStrength = Annotated[float, Bounds(at_least=0, at_most=1e150)]
 """Strength of white noise, per root second; bounded, so that its square is finite."""
@@ -154,6 +159,14 @@ class Model(FrozenModel):
         q = call_user(self.noise_cov, t, dt)
         # Whether it is finite and a covariance is checked once for each value.
         q = check_array(q, "noise_cov", (self.dim, self.dim), finite=False)
+        # What the library computes is a covariance if it is finite; a large diagonal one takes
+        # less time to check than to look up.
+        is_trusted = is_of_library(self.noise_cov)
+        is_plain = is_trusted or (self.dim > _SMALL and is_nonnegative_diagonal(q))
+        if is_plain and all_finite(q):
+            q = q.copy()
+            q.setflags(write=False)
+            return q
         return _check_noise(q.tobytes(), self.dim)
 
     @validated

@@ -92,10 +92,17 @@ def _straight_noise(t: float, dt: float, sigma: float, axes: int) -> Array:
 @lru_cache(maxsize=64)
 def _repeat_along_axes(block: tuple[tuple[float, float], ...], axes: int) -> Array:
     """Kronecker product of a block with I, read-only and cached: few recur in every step."""
-    # All positions, then all velocities: block ⊗ I, the block at each axis's places.
-    matrix = np.zeros((2 * axes, 2 * axes))
-    places = np.arange(axes)
-    matrix.reshape(2, axes, 2, axes)[:, places, :, places] = block
+    # All positions, then all velocities: block ⊗ I. Its four quarters are diagonal, and a
+    # step along a diagonal is one of n + 1 numbers.
+    (upper_left, upper_right), (lower_left, lower_right) = block
+    n = 2 * axes
+    half = n * axes
+    numbers = np.zeros(n * n)
+    numbers[: half : n + 1] = upper_left
+    numbers[axes : half : n + 1] = upper_right
+    numbers[half :: n + 1] = lower_left
+    numbers[half + axes :: n + 1] = lower_right
+    matrix = numbers.reshape(n, n)
     matrix.setflags(write=False)
     return matrix
 

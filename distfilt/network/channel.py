@@ -152,7 +152,7 @@ class Channel:
     @classmethod
     def construct(cls, *args: object, **options: object) -> Channel:
         """Build a channel without checks, from a graph and a ledger that the library made."""
-        make = cast(Callable[..., Channel], cls)
+        make: Callable[..., Channel] = cls
         with skip_validation():
             return make(*args, **options)
 
@@ -207,6 +207,9 @@ class Channel:
         copies, scalars, bytes_ = _count_payloads(payloads, graph.n_agents, self.runs)
         # Copies have the types of what was given.
         sent = cast(list[P], copies)
+        if self._perfect:
+            self._charge_broadcast(sent, scalars, bytes_)
+            return _deliver_everywhere(graph, sent)
         # A link is used if its sender is not silent.
         sends = np.array([payload is not None for payload in sent])
         size = _Size(
@@ -217,8 +220,6 @@ class Channel:
         )
         used = sends[graph.senders]
         arrived = self._transmit(used, size)
-        if self._perfect:
-            return _group_by_receiver(graph, sent, np.flatnonzero(used))
         # A message is in the inbox if any run has received it.
         received = np.flatnonzero(arrived.any(axis=0))
         inbox = _group_by_receiver(graph, sent, received)
@@ -502,8 +503,10 @@ class Channel:
         is_broadcast: bool = True,
     ) -> Mask:
         """Send so many floats over links (E,), all by default; return which arrive, (R, E)."""
+        if links is None and self._perfect and is_broadcast and not acknowledged:
+            return self._transmit_everywhere(numbers)
         if links is None:
-            links = np.ones(self.graph.senders.size, dtype=bool)
+            links = self.graph._every_link
         size = _Size.of_floats(numbers)
         if not is_broadcast:
             size = _Size(numbers, 8 * numbers)
@@ -522,6 +525,37 @@ class Channel:
         self._charge(used[None], size, acknowledged=acknowledged)
         if self._n_all_runs == 1:
             return used[None]
+        return self._repeat_for_runs(used)
+
+    def _transmit_everywhere(self, numbers: int) -> Mask:
+        """Send so many floats over every link of a channel without faults, and charge that."""
+        graph = self.graph
+        self._add_to_ledger(graph._bill_of_floats(numbers))
+        if self._n_all_runs == 1:
+            return graph._every_link[None]
+        return self._repeat_for_runs(graph._every_link)
+
+    def _charge_broadcast(
+        self, sent: Sequence[Payload | None], scalars: Counts, bytes_: Counts
+    ) -> None:
+        """Charge a round in which agents send payloads of these sizes to all their receivers."""
+        graph = self.graph
+        sends = np.array([payload is not None for payload in sent], dtype=np.int64)
+        bill = []
+        for count in (graph.messages_a_round, graph.is_sender):
+            used = count * sends
+            bill += [used, used * scalars, used * bytes_]
+        self._add_to_ledger(bill)
+
+    def _add_to_ledger(self, bill: Sequence[Counts]) -> None:
+        """Enter one round without a loss: what each agent sends, in the order of the ledger."""
+        ledger = self._ledger
+        rounds = ledger.rounds + (1 if self.graph.senders.size else 0)
+        new = [getattr(ledger, name) + n for name, n in zip(_BILLS, bill, strict=True)]
+        self._ledger = Ledger.construct(rounds, *new[:3], ledger.lost, *new[3:])
+
+    def _repeat_for_runs(self, used: Mask) -> Mask:
+        """Return the links in use, (E,), for each run of this channel, (R, E)."""
         everywhere = np.broadcast_to(used, (self._n_all_runs, used.size))
         return np.asarray(everywhere[self._own_runs])
 
@@ -564,7 +598,7 @@ class Channel:
         """Add the waiting rounds of `_mix_without_faults` to the ledger; every link was used."""
         uncharged = self._uncharged
         self._uncharged = {}
-        every_link = np.ones((1, self.graph.senders.size), dtype=bool)
+        every_link = self.graph._every_link[None]
         for numbers, rounds in uncharged.items():
             self._charge(every_link, _Size.of_floats(numbers), repeated=rounds)
 
@@ -739,6 +773,16 @@ def _mask_part(payload: Part, arrived: Mask) -> Part:
     masked = np.where(arrived.reshape(arrived.shape + axes), payload, np.nan)
     masked.flags.writeable = False
     return masked
+
+
+def _deliver_everywhere(graph: Graph, sent: Sequence[P | None]) -> list[dict[int, P]]:
+    """Return for each agent the messages of all that it receives from, by sender, ascending."""
+    inbox: list[dict[int, P]] = [{} for _ in sent]
+    for sender, payload in enumerate(sent):
+        if payload is not None:
+            for receiver in graph._receivers_of[sender]:
+                inbox[receiver][sender] = payload
+    return inbox
 
 
 def _group_by_receiver(

@@ -46,6 +46,10 @@ __all__ = [
 
 def _find_uncertain(covs: Array) -> Mask:
     """Return which components have a variance, (d,); the others are constants known to all."""
+    # The usual case: all variances are positive.
+    variances = covs.diagonal(axis1=-2, axis2=-1)
+    if np.count_nonzero(variances) == variances.size:
+        return np.ones(covs.shape[-1], dtype=bool)
     # A component with a covariance but no variance is left to the check of definiteness.
     rows = (covs != 0).reshape(-1, covs.shape[-1])
     return np.asarray(rows.any(axis=0))
@@ -491,8 +495,8 @@ class _Received:
 
         Angles differ by the shorter way round.
         """
-        senders = self.means[:, self.graph.senders]
-        difference = senders - self.means[:, self.graph.receivers]
+        of_sender = self.means.take(self.graph.senders, axis=1)
+        difference = of_sender - self.means.take(self.graph.receivers, axis=1)
         if self.periods:
             difference = wrap_differences(difference, self.periods)
         return difference
@@ -575,11 +579,11 @@ def _intersection_weights(received: _Received, rule: Rule) -> Pair:
     if rule.startswith("min"):
         return _optimal_weights(received, rule)
     graph = received.graph
-    size = np.ones(received.means.shape[:2])
-    if rule == "equal" and received.arrived.all():
+    arrived = received.arrived
+    if rule == "equal" and np.count_nonzero(arrived) == arrived.size:
         # Each agent's number of messages belongs to the graph.
-        total = size + graph.in_degree
-        return size / total, 1 / total[:, graph.receivers]
+        return graph._equal_weights
+    size = np.ones(received.means.shape[:2])
     if rule != "equal":
         # Weights are proportional to a size of each covariance, such as 1 / trace: its weight
         # against a unit covariance, divided by that one's. Computed against the unit and not
@@ -627,7 +631,7 @@ def _sum_information(
     information = _invert(received.covs)
     # m = m_i + P Σ_j ω_j P_j⁻¹ (m_j - m_i): about the own mean, so that equal means
     # stay and large ones lose no digits.
-    of_sender = information[:, graph.senders]
+    of_sender = information.take(graph.senders, axis=1)
     pull = of_sender @ received.mean_differences()[..., None]
     # One sum over the links for ω_j P_j⁻¹ and, as a further column, for the pull.
     terms = np.concatenate([of_sender, pull], axis=-1)
@@ -649,10 +653,10 @@ def _invert(spd: Array) -> Array:
         inverse = solve_lower(cholesky(spd), unit)
         return np.asarray(inverse.swapaxes(-1, -2) @ inverse)
     # A few matrices are solved faster one by one, P X = I by Cholesky.
-    solutions = []
-    for matrix in spd.reshape(n, d, d):
-        _, solution, failed = dposv(matrix, identity(d), lower=1)
+    unit = identity(d)
+    solutions = np.empty((n, d, d))
+    for k, matrix in enumerate(spd.reshape(n, d, d)):
+        _, solutions[k], failed = dposv(matrix, unit, lower=1)
         if failed:
             raise np.linalg.LinAlgError("Matrix is not positive definite")
-        solutions.append(solution)
-    return np.array(solutions).reshape(spd.shape)
+    return solutions.reshape(spd.shape)

@@ -19,6 +19,7 @@ from ..validation import (
     FrozenModel,
     Indices,
     InvalidArgumentError,
+    Mask,
     NonNegativeInt,
     PositiveFloat,
     PositiveInt,
@@ -30,6 +31,9 @@ __all__ = ["Graph", "complete", "disk", "grid", "path", "ring", "star"]
 
 _DENSE = 200
 """Up to this many agents a dense eigenvalue solver is the faster one."""
+
+_FEW_LINKS = 8
+"""Sums of up to so many terms for each agent are added term by term."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,6 +181,18 @@ class Graph(FrozenModel):
 
     def _sum_by_receiver(self, per_link: Array, axis: int = -2) -> Array:
         """Return sums over each agent's links: E entries along an axis become A."""
+        if 0 < self._degree <= _FEW_LINKS:
+            # As many links end at each agent, in the order of the agents: term by term.
+            axis %= per_link.ndim
+            before = per_link.shape[:axis]
+            behind = per_link.shape[axis + 1 :]
+            n = self.n_agents
+            lead = math.prod(before)
+            by_agent = per_link.reshape(lead, n, self._degree, math.prod(behind))
+            total = 0.0 + by_agent[:, :, 0]
+            for k in range(1, self._degree):
+                total += by_agent[:, :, k]
+            return np.asarray(total.reshape(*before, n, *behind))
         # One sparse product over all other axes at once.
         links_first = per_link.swapaxes(axis, 0)
         shape = (self.n_agents, *links_first.shape[1:])
@@ -198,6 +214,35 @@ class Graph(FrozenModel):
         return np.asarray(np.diff(self.links.indptr), dtype=np.float64)
 
     @cached_property
+    def _degree(self) -> int:
+        """Number of agents that each agent receives from, of a regular graph; 0 of others."""
+        degrees = self.in_degree
+        is_regular = (degrees == degrees[0]).all()
+        return int(degrees[0]) if is_regular else 0
+
+    @cached_property
+    def _receivers_of(self) -> list[list[int]]:
+        """The agents that receive from each agent, ascending."""
+        result: list[list[int]] = [[] for _ in range(self.n_agents)]
+        pairs = zip(self.receivers.tolist(), self.senders.tolist(), strict=True)
+        for receiver, sender in pairs:
+            result[sender].append(receiver)
+        return result
+
+    @cached_property
+    def _every_link(self) -> Mask:
+        """True for each link, (E,), read-only."""
+        links = np.ones(self.senders.size, dtype=bool)
+        links.setflags(write=False)
+        return links
+
+    @cached_property
+    def _equal_weights(self) -> tuple[Array, Array]:
+        """The same weight for an agent itself and each of its links, (1, A) and (1, E)."""
+        total = 1.0 + self.in_degree[None]
+        return 1.0 / total, 1 / total[:, self.receivers]
+
+    @cached_property
     def out_degree(self) -> Array:
         """Number of agents that receive from each agent, (A,)."""
         return np.bincount(self.senders, minlength=self.n_agents).astype(np.float64)
@@ -211,6 +256,23 @@ class Graph(FrozenModel):
     def is_sender(self) -> Indices:
         """One for an agent from which others receive, zero for others, (A,)."""
         return (self.out_degree > 0).astype(np.int64)
+
+    def _bill_of_floats(self, numbers: int) -> tuple[Indices, ...]:
+        """What each agent sends if a round has so many floats on every link.
+
+        Messages, scalars and bytes by link, then transmissions, scalars and bytes by broadcast.
+        """
+        if numbers not in self._bills:
+            bills = []
+            for count in (self.messages_a_round, self.is_sender):
+                bills += [count, count * numbers, count * (8 * numbers)]
+            self._bills[numbers] = tuple(bills)
+        return self._bills[numbers]
+
+    @cached_property
+    def _bills(self) -> dict[int, tuple[Indices, ...]]:
+        """The bills of rounds that have occurred, by their number of floats."""
+        return {}
 
     @cached_property
     def is_directed(self) -> bool:

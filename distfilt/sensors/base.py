@@ -68,11 +68,20 @@ def wrap(
     >>> float(wrap(3 * np.pi / 2).round(6))
     -1.570796
     """
+    return wrap_angles(angles, period)
+
+
+def wrap_angles(angles: Array, period: float) -> Array:
+    """Bring angles into [-period/2, period/2), unchecked: see :func:`wrap`.
+
+    >>> wrap_angles(np.array([-np.pi, np.pi]), 2 * np.pi).round(6)
+    array([-3.141593, -3.141593])
+    """
     half = 0.5 * period
-    inside = (angles >= -half) & (angles < half)
     # The usual case; a copy, since a caller may change the result in place.
-    if inside.all():
+    if np.count_nonzero(np.abs(angles) < half) == angles.size:
         return np.array(angles)
+    inside = (angles >= -half) & (angles < half)
     wrapped = (angles + half) % period - half
     # Rounding can turn an angle just below -half into +half: the same direction, but outside the
     # half-open interval.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Annotated, Literal, TypedDict, cast
 
 import numpy as np
@@ -20,7 +20,7 @@ from ..validation import (
     validated,
 )
 from ..validation.checks import check_distinct
-from .base import Sensor, wrap
+from .base import Sensor, wrap_angles
 from .likelihood import LikelihoodSensor
 
 __all__ = [
@@ -369,9 +369,9 @@ def range_bearing(
 class _Geometry(TypedDict):
     """The arguments that the functions below share."""
 
-    indices: Sequence[int]
+    indices: tuple[int, ...]
     origin: Array
-    observer: Sequence[int]
+    observer: tuple[int, ...]
 
 
 def _geometry(
@@ -389,7 +389,7 @@ def _geometry(
     # A copy: the caller's array may be that of a robot that moves on.
     place = np.array(0.0 if origin is None else origin)
     if observer is None:
-        return {"indices": indices, "origin": place, "observer": ()}
+        return {"indices": tuple(indices), "origin": place, "observer": ()}
     if origin is not None:
         raise ValueError("origin must be None for a sensor on a body of the state")
     n = len(indices)
@@ -402,31 +402,55 @@ def _geometry(
         raise ValueError(
             f"observer must have other components than indices, got {list(observer)}"
         )
-    return {"indices": indices, "origin": place, "observer": observer}
+    return {
+        "indices": tuple(indices),
+        "origin": place,
+        "observer": tuple(observer),
+    }
 
 
 def _offset(
-    x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
+    x: Array, indices: tuple[int, ...], origin: Array, observer: tuple[int, ...]
 ) -> Array:
     """Return the vector from the sensor to the place that some components form."""
-    place = x[..., list(observer[: len(indices)])] if observer else origin
-    return np.asarray(x[..., list(indices)] - place)
+    place = origin
+    if observer:
+        place = x[..., _columns(observer[: len(indices)], x.shape[-1])]
+    return np.asarray(x[..., _columns(indices, x.shape[-1])] - place)
 
 
-def _own_heading(x: Array, indices: Sequence[int], observer: Sequence[int]) -> Array:
+@lru_cache(maxsize=256)
+def _columns(indices: tuple[int, ...], dim: int) -> slice | list[int]:
+    """Return an index of components: a slice, which copies nothing, if they are neighbours.
+
+    >>> _columns((2, 3), 4), _columns((3, 2), 4), _columns((3, 4), 4)
+    (slice(2, 4, None), [3, 2], [3, 4])
+    """
+    columns = list(indices)
+    stop = columns[0] + len(columns)
+    # A slice beyond the last component would lose some without an error.
+    if stop <= dim and columns == list(range(columns[0], stop)):
+        return slice(columns[0], stop)
+    return columns
+
+
+def _own_heading(
+    x: Array, indices: tuple[int, ...], observer: tuple[int, ...]
+) -> Array | float:
     """Return the heading of a sensor on a body of the state, zero without one."""
     if len(observer) <= len(indices):
-        return np.zeros(x.shape[:-1])
+        return 0.0
     return np.asarray(x[..., observer[len(indices)]])
 
 
 def _lengths(vectors: Array) -> Array:
     """Return the lengths of vectors (..., n), as (..., 1)."""
-    return np.asarray(np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True)))
+    squares = vectors * vectors
+    return np.asarray(np.sqrt(np.add.reduce(squares, axis=-1, keepdims=True)))
 
 
 def _insert_columns(
-    slope: Array, indices: Sequence[int], observer: Sequence[int], dim: int
+    slope: Array, indices: tuple[int, ...], observer: tuple[int, ...], dim: int
 ) -> Array:
     """Return the Jacobian (..., m, `dim`) of a function of the offset from the sensor to a place.
 
@@ -434,21 +458,21 @@ def _insert_columns(
     is the same, by those of the sensor's own place s its negative, and by all others zero.
     """
     jacobian = np.zeros((*slope.shape[:-1], dim))
-    jacobian[..., list(indices)] = slope
+    jacobian[..., _columns(indices, dim)] = slope
     if observer:
-        jacobian[..., list(observer[: len(indices)])] = -slope
+        jacobian[..., _columns(observer[: len(indices)], dim)] = -slope
     return jacobian
 
 
 def _distance(
-    x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
+    x: Array, indices: tuple[int, ...], origin: Array, observer: tuple[int, ...]
 ) -> Array:
     """Return distances (..., 1) of states (..., d) from the sensor."""
     return _lengths(_offset(x, indices, origin, observer))
 
 
 def _distance_jacobian(
-    x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
+    x: Array, indices: tuple[int, ...], origin: Array, observer: tuple[int, ...]
 ) -> Array:
     """Return the derivatives (..., 1, d) of distances."""
     offset = _offset(x, indices, origin, observer)
@@ -459,15 +483,24 @@ def _distance_jacobian(
 def _distance_slope(offset: Array, length: Array) -> Array:
     """Return the derivative of vectors' lengths, and zero at the vector zero."""
     # ∂|v|/∂v = vᵀ / |v|
-    return np.asarray(offset / np.where(length > 0, length, 1.0))
+    return np.asarray(offset / _replace_zeros(length, 1.0))
+
+
+def _replace_zeros(length: Array, value: float) -> Array:
+    """Return lengths with a value in place of those that are not positive."""
+    is_positive = length > 0
+    # The usual case
+    if np.count_nonzero(is_positive) == is_positive.size:
+        return length
+    return np.where(is_positive, length, value)
 
 
 def _angle(
     x: Array,
     period: float,
-    indices: Sequence[int],
+    indices: tuple[int, ...],
     origin: Array,
-    observer: Sequence[int],
+    observer: tuple[int, ...],
 ) -> Array:
     """Return directions (..., 1) of states (..., d) from the sensor."""
     offset = _offset(x, indices, origin, observer)
@@ -478,12 +511,13 @@ def _direction(offset: Array, period: float, heading: float | Array) -> Array:
     """Return the angles of vectors (..., 2) from a heading, NaN for the vector zero."""
     angle = np.arctan2(offset[..., 1], offset[..., 0])
     # arctan2(0, 0) is 0, but the sensor's own place has no direction.
-    angle = np.where(offset.any(axis=-1), angle, np.nan)
-    return wrap(angle - heading, period=period)[..., None]
+    if np.count_nonzero(offset) < offset.size:
+        angle = np.where(offset.any(axis=-1), angle, np.nan)
+    return wrap_angles(angle - heading, period)[..., None]
 
 
 def _angle_jacobian(
-    x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
+    x: Array, indices: tuple[int, ...], origin: Array, observer: tuple[int, ...]
 ) -> Array:
     """Return the derivatives (..., 1, d) of directions, NaN at the sensor's own place."""
     offset = _offset(x, indices, origin, observer)
@@ -498,7 +532,7 @@ def _angle_jacobian(
 def _angle_slope(offset: Array, length: Array) -> Array:
     """Return the derivative of vectors' angles, and NaN at the vector zero."""
     # ∂ arctan2(b, a) / ∂(a, b) = (-b, a) / (a² + b²), by unit vectors to avoid overflow.
-    length = np.where(length > 0, length, np.nan)
+    length = _replace_zeros(length, np.nan)
     unit = offset / length
     slope = np.empty(unit.shape)
     slope[..., 0] = -unit[..., 1]
@@ -510,27 +544,36 @@ def _angle_slope(offset: Array, length: Array) -> Array:
 def _range_bearing(
     x: Array,
     heading: float,
-    indices: Sequence[int],
+    indices: tuple[int, ...],
     origin: Array,
-    observer: Sequence[int],
+    observer: tuple[int, ...],
 ) -> Array:
     """Return distances and bearings (..., 2) of states (..., d) from the sensor."""
     offset = _offset(x, indices, origin, observer)
     total_heading = heading + _own_heading(x, indices, observer)
-    angle = _direction(offset, 2 * np.pi, total_heading)
-    return np.concatenate([_lengths(offset), angle], axis=-1)
+    result = np.empty((*offset.shape[:-1], 2))
+    result[..., :1] = _lengths(offset)
+    result[..., 1:] = _direction(offset, 2 * np.pi, total_heading)
+    return result
 
 
 def _range_bearing_jacobian(
-    x: Array, indices: Sequence[int], origin: Array, observer: Sequence[int]
+    x: Array, indices: tuple[int, ...], origin: Array, observer: tuple[int, ...]
 ) -> Array:
     """Return the derivatives (..., 2, d) of distances and bearings."""
     # A constant heading only shifts the bearing, so that it does not enter.
     offset = _offset(x, indices, origin, observer)
     length = _lengths(offset)
+    positive = _replace_zeros(length, np.nan)
+    unit = offset / positive
     slopes = np.empty((*offset.shape[:-1], 2, 2))
-    slopes[..., 0, :] = _distance_slope(offset, length)
-    slopes[..., 1, :] = _angle_slope(offset, length)
+    # As in `_distance_slope` and `_angle_slope`
+    slopes[..., 0, :] = unit
+    if positive is not length:
+        slopes[..., 0, :] = _distance_slope(offset, length)
+    slopes[..., 1, 0] = -unit[..., 1]
+    slopes[..., 1, 1] = unit[..., 0]
+    slopes[..., 1, :] /= positive
     jacobian = _insert_columns(slopes, indices, observer, x.shape[-1])
     if len(observer) > len(indices):
         turn = observer[len(indices)]

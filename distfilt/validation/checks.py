@@ -30,6 +30,7 @@ __all__ = [
     "check_probabilities",
     "format_number",
     "format_shape",
+    "is_nonnegative_diagonal",
     "match_shape",
     "type_name",
 ]
@@ -254,11 +255,12 @@ def check_positive_semidefinite(value: Array, name: str) -> None:
     --------
     >>> check_positive_semidefinite(np.zeros((2, 2)), "noise")
     """
-    if _is_nonnegative_diagonal(value):
+    has_constants = value.ndim != 2 or np.count_nonzero(value.diagonal()) < len(value)
+    if has_constants and is_nonnegative_diagonal(value):
         return
     _check_symmetric(value, name)
     # A noise that leaves some components alone has zeros there, which need no look.
-    if _has_cholesky(_drop_constants(value)):
+    if _has_cholesky(_drop_constants(value) if has_constants else value):
         return
     # Rounding alone may have made an eigenvalue negative, by 1e-9 of the variances at most.
     smallest = _smallest_eigenvalues(value)
@@ -266,12 +268,12 @@ def check_positive_semidefinite(value: Array, name: str) -> None:
         _raise_not_positive(value, name, smallest, "semidefinite")
 
 
-def _is_nonnegative_diagonal(value: Array) -> bool:
+def is_nonnegative_diagonal(value: Array) -> bool:
     """Whether a single square matrix is diagonal, without a negative number or NaN.
 
     >>> (
-    ...     _is_nonnegative_diagonal(np.diag([1.0, 0.0])),
-    ...     _is_nonnegative_diagonal(-np.eye(2)),
+    ...     is_nonnegative_diagonal(np.diag([1.0, 0.0])),
+    ...     is_nonnegative_diagonal(-np.eye(2)),
     ... )
     (True, False)
     """

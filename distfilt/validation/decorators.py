@@ -265,7 +265,7 @@ def call_user(function: Callable[..., R], *args: object, **options: object) -> R
     >>> call_user(max, 1, 2)
     2
     """
-    # A partial has no module; its innermost function does.
+    # As `is_of_library`, without a call for each call.
     unwrapped: Callable[..., object] = function
     while isinstance(unwrapped, partial):
         unwrapped = unwrapped.func
@@ -277,6 +277,20 @@ def call_user(function: Callable[..., R], *args: object, **options: object) -> R
         return function(*args, **options)
     finally:
         _NESTED.reset(token)
+
+
+def is_of_library(function: Callable[..., object]) -> bool:
+    """Whether a function, or the innermost one of a partial, is one of this package.
+
+    >>> is_of_library(max), is_of_library(partial(is_of_library, max))
+    (False, True)
+    """
+    # A partial has no module; its innermost function does.
+    unwrapped = function
+    while isinstance(unwrapped, partial):
+        unwrapped = unwrapped.func
+    module = getattr(unwrapped, "__module__", None) or ""
+    return bool(module.startswith("distfilt."))
 
 
 class FrozenModel:

@@ -43,8 +43,8 @@ def trace_calls(action: Callable[[], Any]) -> list[Call]:
     Examples
     --------
     >>> from distfilt.sensors import wrap
-    >>> [call.function for call in trace_calls(lambda: wrap(0.1))][-1]
-    'wrap'
+    >>> [call.function for call in trace_calls(lambda: wrap(0.1))][-2:]
+    ['wrap', 'wrap_angles']
     """
     calls: list[Call] = []
     depth = 0
