@@ -52,7 +52,7 @@ from ..validation.clocks import warn_of_clock
 from .bridge import insert_times
 from .failures import RECOVERABLE, FilterError, is_argument_error
 from .observations import Observation, match_delayed, read_observations
-from .plans import Entries, TimesArgument, find_degrees, plan_steps
+from .plans import StepObservations, TimesArgument, find_degrees, plan_steps
 from .priors import Prior
 from .record import (
     SCORES,
@@ -429,7 +429,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         self,
         state: S,
         grid: Array,
-        entries: Iterable[Entries],
+        entries: Iterable[StepObservations],
         delayed: Sequence[Observation],
         *,
         reuse_rng: bool,

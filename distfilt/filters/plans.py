@@ -24,7 +24,7 @@ else:
     # Checked by `plan_steps`, which converts it.
     TimesArgument = object
 
-__all__ = ["TimesArgument", "find_degrees", "plan_steps"]
+__all__ = ["StepObservations", "TimesArgument", "find_degrees", "plan_steps"]
 
 
 SensorLists = Sequence[Sequence[Sensor]]
@@ -33,11 +33,21 @@ Series = Sequence[object] | NDArray[np.generic]
 """The observations of an agent, one entry for each time."""
 
 
-class Entries(NamedTuple):
+class StepObservations(NamedTuple):
     """The observations of one time of a run, an entry for each agent.
 
-    They have been read if each agent has a list of Observations that fit its sensors, with
-    finite values: then a step need not look at them again.
+    Attributes
+    ----------
+    observations : sequence
+        Observations of each agent.
+    are_read : bool
+        Whether each agent has a list of Observations that fit its sensors, with finite values.
+        Then a step need not look at them again.
+
+    Examples
+    --------
+    >>> StepObservations([[Observation(1.0, 0, [2.0])], []], are_read=True).are_read
+    True
     """
 
     observations: Sequence[Any]
@@ -46,7 +56,7 @@ class Entries(NamedTuple):
 
 def plan_steps(
     f: Filter[AnyState], state: AnyState, times: TimesArgument, observations: object
-) -> tuple[Array, Iterator[Entries]]:
+) -> tuple[Array, Iterator[StepObservations]]:
     """Return the times of a run's steps, and an iterator over the observations of each.
 
     >>> from distfilt.filters import GaussianFilter
@@ -90,7 +100,7 @@ def _plan_events(
     state: AnyState,
     grid: Array,
     events: Sequence[Observation],
-) -> tuple[Array, Iterator[Entries]]:
+) -> tuple[Array, Iterator[StepObservations]]:
     """Sort events by time; there is a step at each time of the grid and of an event."""
     by_time: dict[float, list[list[Observation]]] = {}
     for t in grid:
@@ -112,7 +122,7 @@ def _plan_events(
     unread = {*times}
     if f.reads_by_default:
         unread = {e.t for e in _find_unfit(_sensors_of(f), _runs_of(state), events)}
-    entries = [Entries(by_time[t], t not in unread) for t in times]
+    entries = [StepObservations(by_time[t], t not in unread) for t in times]
     return np.array(times), iter(entries)
 
 
@@ -151,7 +161,7 @@ def _runs_of(state: AnyState) -> tuple[int, ...]:
 
 def _plan_series(
     f: Filter[AnyState], state: AnyState, grid: Array, observations: object
-) -> Iterator[Entries]:
+) -> Iterator[StepObservations]:
     """Take each agent's series (T, ...) apart into times."""
     series_by_agent: list[Series | None] = []
     for series in list_by_agent(observations, f.n_agents):
@@ -182,7 +192,7 @@ def _list_rows(
     grid: Array,
     series_by_agent: list[Series | None],
     shapes: list[tuple[int, ...] | None],
-) -> Iterator[Entries]:
+) -> Iterator[StepObservations]:
     """Yield the rows of all agents' series time by time.
 
     Arrays of these shapes are read, where all of their numbers are finite: those of agents with
@@ -203,13 +213,13 @@ def _list_rows(
     for k, t in enumerate(grid.tolist()):
         rows = [None if series is None else series[k] for series in series_by_agent]
         if not fits or not is_read[k]:
-            yield Entries(rows, False)
+            yield StepObservations(rows, False)
             continue
         read = [
             [] if row is None else [Observation.construct(t, agent, row)]
             for agent, row in enumerate(rows)
         ]
-        yield Entries(read, True)
+        yield StepObservations(read, True)
 
 
 def _sensors_of(f: Filter[AnyState]) -> SensorLists:
