@@ -192,8 +192,11 @@ def _refine_differences(
     second, finer, finer_error = _refine_differences(
         function, x, difference, 1e-2 * step
     )
-    # A change of exactly zero says nothing: the step may be below the function's resolution.
+    # A bend that vanishes for a shorter step is curvature: noise looks bent over steps of any size.
+    # A change f(x + h) - f(x - h) of exactly zero says nothing, since the shorter step may be below
+    # the function's resolution.
     is_straight = ~second.is_bent & (second.change != 0)
+    # It may also have vanished only for the steps after that one.
     first.has_curvature = is_bent & (is_straight | second.has_curvature)
     slope = np.where(is_bent, finer, first.slope)
     return first, slope, np.where(is_bent, finer_error, error)

@@ -209,6 +209,7 @@ def solve_lower(lower: Array, right: Array, *, transposed: bool = False) -> Arra
     else:
         solution = np.empty((n, d, k))
         for i in range(n):
+            # The first of the two substitutes in numpy: faster for a small factor and many columns.
             if d <= _SMALL and k > _MANY_PER_ROW * d:
                 solution[i] = _solve_one_factor(factors[i], sides[i], transposed)
             else:

@@ -309,6 +309,8 @@ def step_members(model: _Model, x: Array, t: float, dt: float) -> Array:
         # Every member moves by about the mean displacement, taken as a circular mean.
         return x + circular_mean(values - x, periods)
 
+    # Values that span more than half a period are brought near to the tangent, or, if the model is
+    # not linear, to the fallback.
     return gather(values, bring_near, tangent, fallback)
 
 

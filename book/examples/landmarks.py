@@ -1,4 +1,4 @@
-"""Robots that see each other and landmarks: from folders of logs to a table of errors."""
+"""Robots that see each other and landmarks: from logs to a table of errors."""
 
 import sys
 from collections.abc import Iterator
@@ -15,18 +15,24 @@ from distfilt.models import planar_odometry
 DT = 0.1  # the grid of times, in s
 BEGIN = 10  # the first step at which the filter may start
 START_STD = (0.05, 0.05, 0.05)  # of the first poses, in m and rad
-# Odometry in m/s, m/s and rad/s, sightings in m and rad, the lag of their stamps in s
+# Odometry in m/s, m/s, rad/s; sightings in m, rad; the lag of stamps in s
 SETTING = {"odometry": (0.04, 0.0, 0.04), "sight": (0.1, 0.04), "lag": 0.1}
 
 
 def locate(
     data: datasets.Dataset, setting: dict[str, Any], nearest: float = 1.0
 ) -> Iterator[tuple[int, GaussianState]]:
-    """Yield each step with sightings, and the state of all poses and landmarks after them."""
+    """Yield each step with sightings, and the state of poses and landmarks."""
     n = 2 * len(data.landmarks)
     times, rates = data.body_rates(DT)
-    model = planar_odometry(times, rates, std=setting["odometry"], n_constants=n)
-    f = GaussianFilter(model, [None], gate_probability=0.999, record_evidence=True)
+    noise = setting["odometry"]
+    model = planar_odometry(times, rates, std=noise, n_constants=n)
+    f = GaussianFilter(
+        model,
+        [None],
+        gate_probability=0.999,
+        record_evidence=True,
+    )
     rng = np.random.default_rng(0)
     start = times[max(BEGIN, int(np.ceil(data.begin / DT)))]
     mean, cov = data.start_poses(start, std=START_STD, rng=rng)

@@ -20,7 +20,7 @@ def make_model(data: datasets.Dataset) -> Model:
 
 
 def list_ranges(data: datasets.Dataset) -> list[Observation]:
-    """Return the ranges between robots, and those to anchors that have been surveyed."""
+    """Return the ranges between robots, and those to surveyed anchors."""
     anchors = data.of_kind("survey").set_index("subject")
     return datasets.list_observations(data, "range", RANGE_STD, anchors=anchors)
 
@@ -28,7 +28,10 @@ def list_ranges(data: datasets.Dataset) -> list[Observation]:
 RULES: dict[str, dict[str, Any]] = {
     "no communication": {"share_observations": False},
     "naive fusion": {"share_observations": False, "fusion": naive_fusion},
-    "intersection": {"share_observations": False, "fusion": covariance_intersection},
+    "intersection": {
+        "share_observations": False,
+        "fusion": covariance_intersection,
+    },
     "all observations": {"share_observations": True},
 }
 

@@ -124,7 +124,7 @@ def norm_constraint(
         return np.asarray((x[..., columns] ** 2).sum(axis=-1, keepdims=True))
 
     def jacobian(x: Array) -> Array:
-        # The derivative of |x_I|² is 2 x_I'.
+        # The derivative of |x_I|² is 2 x_Iᵀ.
         slope = np.zeros((*x.shape[:-1], 1, x.shape[-1]))
         slope[..., 0, columns] = 2 * x[..., columns]
         return slope
@@ -191,7 +191,7 @@ def project(
     # D_i - d̂ and x_i - x̄.
     output_anomalies = residual - mean_residual
     anomalies = ensemble - ensemble.mean(axis=-2, keepdims=True)
-    # K' = (Σ_dd + ε I)⁻¹ Σ_dx, by a solve.
+    # Kᵀ = (Σ_dd + ε I)⁻¹ Σ_dx, by a solve.
     output_covariance = output_anomalies.mT @ output_anomalies / n
     output_covariance += regularisation * np.eye(residual.shape[-1])
     cross_covariance = output_anomalies.mT @ anomalies / n
@@ -365,7 +365,7 @@ def _make_tangent(x: Array, constraint: Constraint, motion: Motion) -> None:
     velocities = list(motion[1])
     _check_motion(motion, x.shape[-1])
     slope = constraint.jacobian(x)[..., positions]
-    # v <- v - J'(J J')⁻¹ J v, so that J v = 0.
+    # v <- v - Jᵀ(J Jᵀ)⁻¹ J v, so that J v = 0.
     rate = (slope @ x[:, velocities, None])[..., 0]
     x[:, velocities] += _normal_step(slope, rate)
 

@@ -222,10 +222,11 @@ def _cost_on_support(cost: Array, a: Array, b: Array) -> Array:
 def _solve_on_support(
     cost: Array, a: Array, b: Array, solve: Solve, limit: float | None = None
 ) -> tuple[Array, Array]:
-    """Solve for rows and columns with mass, for costs in units of their range up to a limit.
+    """Solve for the rows and columns with mass, with their costs scaled for the solver.
 
-    Returns the plan (N, M), and the columns' potentials (M,) in the units of the cost, zero for
-    those without mass.
+    The unit of the scaled costs is their range: up to the limit, if there is one, above which costs
+    are larger than one. Returns the plan (N, M), and the columns' potentials (M,) in the units of
+    the cost, zero for those without mass.
     """
     rows = np.flatnonzero(a)
     columns = np.flatnonzero(b)
@@ -233,7 +234,8 @@ def _solve_on_support(
     part, g = solve(scaled_cost, a[rows], b[columns])
     matrix = np.zeros(cost.shape)
     matrix[np.ix_(rows, columns)] = part
-    # The potentials of c = minimum + scale c' are scale f and minimum + scale g.
+    # If f_i + g_j <= c'_ij for the scaled costs c', then c = minimum + scale c' has the potentials
+    # scale f and minimum + scale g.
     potential = np.zeros(cost.shape[1])
     potential[columns] = minimum + scale * g
     return matrix, potential
@@ -261,7 +263,9 @@ def _solve_allowed(
 
 
 def _largest_allowed(cost: Array) -> float | None:
-    """Return the largest of costs (N, M) below a wide gap that forbidden links leave, if any.
+    """Return the largest of costs (N, M) below a wide gap, if there is one.
+
+    Costs above the gap are huge, as a user gives them to links that the plan must not use.
 
     >>> _largest_allowed(np.array([[0.0, 1.0], [3.0, 1e9]]))
     3.0
@@ -427,7 +431,7 @@ def _correct_in_proportion(matrix: Array, a: Array, b: Array) -> Array:
     for _ in range(3):
         row_sums = matrix.sum(axis=1)
         column_sums = matrix.sum(axis=0)
-        # diag(T1) u + T v = a - T1 and T'u + diag(T'1) v = b - T'1. Adding a constant to u and
+        # diag(T1) u + T v = a - T1 and Tᵀu + diag(Tᵀ1) v = b - Tᵀ1. Adding a constant to u and
         # taking it off v changes nothing: the system is singular, and the least solution is taken.
         system = np.block(
             [[np.diag(row_sums), matrix], [matrix.T, np.diag(column_sums)]]
@@ -476,7 +480,7 @@ def _solve_unit_entropy(
         # With more damping than 1e9 the steps vanish: nothing is left to gain.
         if error < tolerance or damping > 1e9:
             break
-        # Hessian diag(T'1) - T' diag(a)⁻¹ T, damped in units of the masses.
+        # Hessian diag(Tᵀ1) - Tᵀ diag(a)⁻¹ T, damped in units of the masses.
         curvature = np.diag(sums + damping * columns)
         hessian = curvature - matrix.T @ (matrix / rows[:, None])
         trial = g - np.linalg.solve(hessian, sums - columns)

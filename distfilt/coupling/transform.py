@@ -419,11 +419,12 @@ def _match_weighted_moments(
     mean = weights[..., None, :] @ ensemble
     prior_anomalies = ensemble - mean
     anomalies = transformed - transformed.mean(axis=-2, keepdims=True)
-    # P = K K' is the weighted covariance.
+    # P = K Kᵀ is the weighted covariance, with weights that sum to one.
     covariance = prior_anomalies.mT @ (weights[..., None] * prior_anomalies)
     root = _factor_by_size(covariance)
-    # With anomalies A, A B is U V' K' sqrt(N), where U S V' = A K: its columns U V' are the
-    # orthonormal ones nearest to A K. P comes out to rounding, however small C is.
+    # With B = K (Kᵀ C K)^(-1/2) Kᵀ for the anomalies A and their covariance C = AᵀA / N, and with
+    # A K = U S Vᵀ, the new anomalies are A B = √N U Vᵀ Kᵀ. As the columns of U are orthonormal,
+    # their covariance is K Kᵀ to rounding, however small C is.
     product = anomalies @ root
     u, sizes, vt = np.linalg.svd(product, full_matrices=False)
     # Directions without spread get none.

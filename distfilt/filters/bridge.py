@@ -176,9 +176,10 @@ def insert_gaussian(
     std = deviations(cov[..., before, before])
     model = f.model_of_states(state.runs)
     law = bridge_states(model, mean[..., before], (start, t_obs, end), std)
+    # Given the state before, x(τ) is `forecast` and the state after is `law.after`, on average.
     innovation = wrap_differences(mean[..., after] - law.after, f.periods)
     new_mean = law.forecast + (law.gain @ innovation[..., None])[..., 0]
-    # x(τ) = (F₁ - G F₂ F₁) x₀ + G x₁ + e
+    # x(τ) = F₁ x₀ + G (x₁ - F₂ F₁ x₀) + e, for x₀ before and x₁ after
     rows = np.zeros((*mean.shape[:-1], d, mean.shape[-1]))
     rows[..., after] = law.gain
     rows[..., before] = (np.eye(d) - law.gain @ law.slope_after) @ law.slope_before

@@ -62,7 +62,8 @@ class DensityState(State):
     observed : ndarray, (F, n)
         The swarm's kernel estimate, as each agent with a filter estimates it.
     positions_sent : ndarray, (A,)
-        The number of agents, as each agent estimates it.
+        The number of agents whose kernels are in an agent's density, as it counts or estimates
+        them.
     parts : int
         Number of connected components of the present agents' graph in the last step.
     filters : LowRank
@@ -227,6 +228,7 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
     ) -> dict[str, object]:
         """Return the estimates at the agents' first positions (A, d), NaN for absent agents."""
         snapshot = self._snapshot(prior, "prior", 0.0)
+        # Only these agents have a filter. At the start all are taken to be connected.
         agents = self.filtering
         filters = low_rank_start(self._prior_factor, self._prior_mean(snapshot)[agents])
         return {
@@ -337,8 +339,9 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
     def summarize(self, state: DensityState) -> Summary:
         """Return densities and variances of all agents, NaN for those without a filter.
 
-        ``parts`` is the number of parts of the network, ``positions_sent`` each agent's estimate
-        of the number of agents, ``mass`` the estimate's integral.
+        ``parts`` is the number of parts of the network, ``positions_sent`` the number of
+        agents whose kernels are in an agent's density, as it counts or estimates them, ``mass``
+        the density's integral.
         """
         shape = (self.n_agents, self.model.grid.size)
         mean = np.full(shape, np.nan)

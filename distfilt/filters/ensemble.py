@@ -628,6 +628,7 @@ class TransportFilter(_EnsembleSummary):
             if step.scores:
                 normalizer = log_normalizer(group.target, group.noise)
                 logs[..., rows, :] += normalizer[..., None]
+            # Equal weights, so that only a far observation can give a warning.
             warn_of_weights(0 * predicted[..., 0], predicted, group.target, group.noise)
         return logs
 
@@ -640,8 +641,9 @@ class TransportFilter(_EnsembleSummary):
             weights = normalize_weights(logs)
             stack = [fold(members, self.periods, weights) for members in stack]
 
-        def compute(logs: Array, *args: Array) -> tuple[Array, ...]:
-            *times, _, _ = args
+        def compute(logs: Array, *arguments: Array) -> tuple[Array, ...]:
+            # The last two are what `step.apply` adds for all rows: a shared array and a generator.
+            *times, _shared, _rng = arguments
             # The plan is optimal for the present members and moves their past along.
             weights = normalize_weights(logs)
             plan = transport_plans(times[-1], logs)

@@ -233,17 +233,21 @@ def fuse_beliefs(step: Step[AnyState], values: tuple[Array, ...]) -> tuple[Array
     """
     inputs = [v.copy() for v in values]
     if step.any_failed:
-        # A failed run's values may make the rule fail again, so those of a good run stand in.
+        # A failed run's values may make the rule fail again, so those of a good run stand in:
+        # `keep_failed` puts its second argument into the failed runs. One run at least is good:
+        # otherwise nothing is fused.
         good = tuple(np.argwhere(~step.failed)[0])
         inputs = [step.keep_failed(v, v[good]) for v in inputs]
     run_numbers = _number_runs(step.runs)
     channel = step.channel
     ledger = channel.ledger
-    # The channels of the attempts that went through, each with the same ledger before.
+    # The channels of the attempts that went through. Each starts from the ledger before the fusion,
+    # so that no attempt is charged for another.
     used: list[Channel] = []
 
-    def fuse_runs(*arrays: Array) -> tuple[Array, ...]:
-        *beliefs, numbers, _, _ = arrays
+    def fuse_runs(*arguments: Array) -> tuple[Array, ...]:
+        # The last two are what `step.apply` adds for all rows: a shared array and a generator.
+        *beliefs, numbers, _shared, _rng = arguments
         attempt = channel.for_run(numbers.astype(np.intp), ledger)
         # A rule of a family that fuses in a step is a function.
         rule = cast("Callable[..., object]", step.filter.fusion)

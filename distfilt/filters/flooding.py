@@ -145,6 +145,7 @@ class _Flood:
     def _keep(self, agent: int, maker: int, bundle: Bundle, is_new: Mask) -> None:
         """Take the values of a bundle in the runs in which it is new to an agent."""
         box = self.known[agent]
+        # If the agent had none in any run, the new one fills all: only `present` runs are read.
         old = box.get(maker, bundle)
         mask = is_new[..., None]
         values = [np.where(mask, new, v) for new, v in zip(bundle, old, strict=True)]

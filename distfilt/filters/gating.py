@@ -154,6 +154,7 @@ class RejectionStreaks:
 
     def describe(self, number: int, kind: str) -> str:
         """Return the warning of a gate that keeps rejecting observations of one streak."""
+        # As :meth:`number_of` counts: number = (agent n_sources + source) n_places + place.
         agent, source = divmod(number // self.n_places, self.n_sources)
         origin = ""
         if self.has_sources and source != agent:

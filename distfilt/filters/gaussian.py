@@ -185,8 +185,10 @@ class GaussianFamily(
             If a standard deviation after the fusion is below the rounding of its mean.
         """
         means, covs = self._check_forecast(step)
-        # Joseph's form leaves symmetric covariances, a forecast does so up to rounding.
+        # A forecast's covariances are symmetric up to rounding. Joseph's form makes those of a
+        # group's agents exactly symmetric; after a group of all agents all are.
         is_symmetric = False
+        # Observations come oldest first; their place is that of their time among those kept.
         for place, group in step.received():
             means, covs = self._condition(means, covs, place, group, step)
             is_symmetric = is_symmetric or len(group.agents) == self.n_agents
@@ -317,7 +319,8 @@ class GaussianFamily(
             # For a linear function unscented points would give the same.
             value = function(mean[..., None, :])[..., 0, :]
             return value, jacobian(mean, cov), None
-        # P = L Lᵀ; the divisor is L, with ones in place of zeros on its diagonal.
+        # P = L Lᵀ; the divisor is L, with ones on the diagonal in columns of zeros. These belong to
+        # components without variance: their points do not differ, and their slope becomes zero.
         root, divisor = _factor_covariance(cov)
         d = mean.shape[-1]
         points, weights = unscented_points(mean, root, kappa=self.kappa)
@@ -325,7 +328,7 @@ class GaussianFamily(
         value = weights @ values
         anomalies = values - value[..., None, :]
         # Opposite points lie ±√(d+κ) columns of the root L from the mean, so that half their
-        # differences are (H L)ᵀ √(d+κ) and H follows by a triangular solve, Lᵀ Hᵀ = (H L)ᵀ.
+        # differences are (H L)ᵀ √(d+κ). H follows from Lᵀ Hᵀ = (H L)ᵀ with upper triangular Lᵀ.
         ahead = values[..., 1 : d + 1, :]
         behind = values[..., d + 1 :, :]
         scaled_slope = (ahead - behind) / (2 * np.sqrt(d + self.kappa))
@@ -334,7 +337,8 @@ class GaussianFamily(
         total = (weights[:, None] * anomalies).mT @ anomalies
         extra = total - scaled_slope.mT @ scaled_slope
         if not all_finite(extra):
-            # Components that some point cannot see are left out, and have none.
+            # Components of the value that some point cannot see are NaN, and so is their slope: an
+            # update leaves them out. NaN would spoil the covariance of the others.
             extra = np.where(np.isnan(extra), 0.0, extra)
         return value, slope, extra
 

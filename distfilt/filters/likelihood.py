@@ -176,6 +176,7 @@ class LikelihoodConsensusFilter(ParticleFamily):
             return
         # Each agent weights a copy by its own observations, as any particle filter does.
         own = log_weights.copy()
+        # Particles whose weight is not zero: the logarithm of zero is stored as -1e300.
         regression = _LeastSquares(
             self._evaluate_basis(stack[-1]), log_weights > -1e299
         )
@@ -325,7 +326,7 @@ def _whiten(group: Received, members: Array) -> Array:
     Missing numbers have none; what a particle cannot predict is NaN.
     """
     predicted = group.predict(members, None, branch="each")
-    # L⁻¹ (y - h(x)) with R = L L'; a missing number has a unit variance of its own. So has that
+    # L⁻¹ (y - h(x)) with R = L Lᵀ; a missing number has a unit variance of its own. So has that
     # of a sensor that is a likelihood, which has no variance.
     variance = np.diagonal(group.noise, axis1=-2, axis2=-1)
     missing = np.isnan(group.target) | (variance == 0)

@@ -165,7 +165,8 @@ class ParticleFamily(MembersFilter[ParticleState]):
         """Return the earlier and the present members after the fusion rule, if any."""
         if not step.has_fusion:
             return stack[:-1], stack[-1]
-        # A fusion rule moves an ensemble, so the particles need equal weights.
+        # A fusion rule moves an ensemble, so the particles need equal weights: all agents resample,
+        # each with one uniform number.
         offset = step.rng.random((*log_weights.shape[:-1], 1))
         everybody = np.ones(log_weights.shape[:-1], bool)
         weights = np.exp(log_weights)

@@ -432,7 +432,10 @@ def _read_truth(
 
 
 def _read_series(entry: Any, name: str, times: Array) -> Array:
-    """Return a series, or the values of a function at the times; NaN where nothing is known."""
+    """Return a series, or the values of a function at the times; NaN where nothing is known.
+
+    Any shape is accepted here: the caller compares it with those that it can use.
+    """
     if callable(entry):
         values = [np.asarray(call_user(entry, t)) for t in times.tolist()]
         shapes = {value.shape for value in values}
@@ -441,7 +444,7 @@ def _read_series(entry: Any, name: str, times: Array) -> Array:
                 f"{name} must return one shape at all times, got {sorted(shapes)}"
             )
         entry = np.stack(values) if values else np.zeros(0)
-    return check_array(entry, name, None, finite=False)
+    return check_array(entry, name, finite=False)
 
 
 def _read_components(

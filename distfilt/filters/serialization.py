@@ -78,6 +78,7 @@ def load_fields(cls: type[T], path: str | PathLike[str]) -> T:
         header = json.loads(str(arrays["header"]))
         if header["format"] != _FORMAT or header["kind"] != _class_name(cls):
             raise ValueError(f"format {header['format']}, a {header['kind']}")
+        # The fields alone: the class is known, and its name in the file is not looked up.
         return cls(**_decode({"dict": header["state"]["dict"]}, arrays))
     # zip, JSON and numpy each raise their own errors for damaged data.
     except Exception as error:

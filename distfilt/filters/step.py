@@ -262,6 +262,7 @@ class Step(Generic[S]):
         for agent, observations in enumerate(self.observations):
             of_agent: list[tuple[Sensor, Array]] = []
             for o in observations:
+                # Sensors of changes, and a gate, keep count of each agent's observations.
                 if self.references is not None:
                     self.references.receive(agent, o)
                 if self.streaks is not None:

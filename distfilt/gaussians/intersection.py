@@ -133,12 +133,14 @@ def intersect_gaussians(
 def _fill_absent(value: Array, present: Mask, axes: int, name: str) -> Array:
     """Put the first present source in the place of those that are absent.
 
-    `value` has the axes of `present`, and `axes` more.
+    Their weight is zero, so that any finite numbers do; NaN times zero would be NaN. `present`
+    (..., B) says which of B sources are, and `value` has `axes` more axes.
     """
     if not present.all():
         source_axis = present.ndim - 1
         value = np.broadcast_to(value, present.shape + value.shape[-axes:])
         expanded = present.reshape(present.shape + (1,) * axes)
+        # The largest of flags is the first that is set.
         first = expanded.argmax(axis=source_axis, keepdims=True)
         substitute = np.take_along_axis(value, first, axis=source_axis)
         value = np.where(expanded, value, substitute)

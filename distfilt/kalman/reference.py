@@ -159,6 +159,7 @@ def filterpy_ekf(
 
     def step(kf: _Filterpy, k: int, z: Array, present: Mask) -> None:
         """Forecast to time k, and update by the components of z that are present."""
+        # The clock begins with the prior's time, so that `times` k is its entry k + 1.
         t = float(clock[k])
         dt = float(clock[k + 1] - clock[k])
         # The linearisation is about the last analysis mean.
@@ -228,6 +229,7 @@ def filterpy_ukf(
 
     def step(kf: _Filterpy, k: int, z: Array, present: Mask) -> None:
         """Forecast to time k, and update by the components of z that are present."""
+        # The clock begins with the prior's time, so that `times` k is its entry k + 1.
         t = float(clock[k])
         dt = float(clock[k + 1] - clock[k])
         kf.Q = model.noise_at(kf.x, t, dt)
@@ -237,6 +239,8 @@ def filterpy_ukf(
         forecasts = iter(model.step(points, t, dt))
         kf.predict(dt, fx=lambda x, dt: next(forecasts))
         if present.any():
+            # filterpy averages and subtracts plainly: angles are put on one branch for it. Its
+            # sigmas_f are the points of the forecast, and Wm their weights.
             predicted, observed = _unwrap(sensor, kf.sigmas_f, kf.Wm, z)
             rows = iter(predicted[:, present])
             noise_cov = sensor.noise_cov[np.ix_(present, present)]

@@ -217,8 +217,9 @@ def crps(
         errors = np.take_along_axis(errors, order, axis=-2)
         columns = np.broadcast_to(weights[..., None], errors.shape)
         w = np.take_along_axis(columns, order, axis=-2)
-    # The score is Σ_i w_i |e_i| - ½ Σ_ij w_i w_j |e_i - e_j|. Of sorted errors the second sum is
-    # Σ_i w_i e_i (2 W_i - w_i - 1), with W_i the sum of the weights up to i.
+    # The score is Σ_i w_i |e_i| - ½ Σ_ij w_i w_j |e_i - e_j|. Of sorted errors half the second sum,
+    # in which each pair appears twice, is Σ_i w_i e_i (2 W_i - w_i - 1), with W_i the sum of the
+    # weights up to i: e_i is the larger of pairs with weight W_i - w_i, and the smaller of 1 - W_i.
     coefficients = 2 * np.cumsum(w, axis=-2) - w - 1
     return np.asarray((w * (np.abs(errors) - coefficients * errors)).sum(axis=-2))
 

@@ -344,6 +344,7 @@ def _absorb_into_heaviest(mixture: GaussianMixture, n_heaviest: int) -> Gaussian
 
     All costs are those before any merger.
     """
+    # The costs are the same in coordinates in which all numbers are of the order of one.
     weights, means, covs, _ = _whiten(mixture)
     order = np.argsort(-weights, kind="stable")
     heavy = order[:n_heaviest]

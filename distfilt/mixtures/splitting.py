@@ -167,7 +167,8 @@ def _place_on_line(parts: int) -> tuple[float, Array, Array]:
     The mixture has mean 0 and variance 1; :func:`split_gaussian` has its formula.
     """
     reach = 2.5 if parts <= 8 else 3.0
-    # The outermost of means 1.5 s apart is at 0.75 s (n - 1), and 0.75² = 0.5625.
+    # The outermost of n means 1.5 s apart is at 0.75 s (n - 1). It shall be `reach` times the
+    # deviation √(1 - s²) that is left to the means, which gives s; 0.75² = 0.5625.
     std = reach / np.sqrt(reach**2 + 0.5625 * (parts - 1) ** 2)
     places = 1.5 * std * (np.arange(parts) - (parts - 1) / 2)
     # The squared difference from N(0, 1) is wᵀ A w - 2 wᵀ b and a constant, least for A w = b, with

@@ -99,8 +99,10 @@ def _to_rotation(quaternion: Array) -> Rotation:
 def left_directions(quaternion: Quaternion) -> Array:
     r"""Derivatives of a quaternion with respect to small rotations about the frame's axes.
 
-    This is the derivative D of :func:`rotate` in its angle, at zero. Equation (21) of Grange et al.
-    is :math:`\dot{\mathbf q} = -\mathbf D(\mathbf q)\,\boldsymbol\omega`.
+    Such a rotation multiplies the quaternion from the left. This is the derivative D of
+    :func:`rotate` in its angle, at zero: a small angle :math:`\boldsymbol\theta` leads from
+    :math:`\mathbf q` to :math:`\mathbf q+\mathbf D(\mathbf q)\,\boldsymbol\theta`. Equation (21) of
+    Grange et al. is :math:`\dot{\mathbf q} = -\mathbf D(\mathbf q)\,\boldsymbol\omega`.
 
     Parameters
     ----------
@@ -121,7 +123,8 @@ def left_directions(quaternion: Quaternion) -> Array:
     """
     scalar = quaternion[..., :1, None]
     vector = quaternion[..., 1:]
-    # D = ½ [-vᵀ; s I - [v]×] of the quaternion (s, v)
+    # For the quaternion (s, v), D θ is half the product (0, θ)(s, v) = (-θᵀv, s θ + θ × v), so that
+    # D = ½ [-vᵀ; s I - [v]×].
     twice = np.empty((*quaternion.shape, 3))
     twice[..., 0, :] = -vector
     twice[..., 1:, :] = -cross_matrix(vector)

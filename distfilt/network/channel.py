@@ -417,6 +417,8 @@ class Channel:
         # Losses and weights of many rounds at once, as many as the cache holds.
         block = max(1, _BLOCK_SIZE // (1 + self._n_all_runs * self.graph.senders.size))
         while rounds > 0:
+            # Every link carries a message in every round. If both ends must know whether it came,
+            # the receiver acknowledges it.
             used = np.ones(self.graph.senders.size, dtype=bool)
             count = min(rounds, block)
             arrived = self._transmit_rounds(

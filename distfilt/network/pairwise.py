@@ -267,6 +267,7 @@ def _fuse_in_turn(received: _Received, pair_rule: PairRule) -> Pair:
     graph = received.graph
     means = received.means.copy()
     covs = received.covs.copy()
+    # In turn n each agent that has an n-th neighbour receives from it, over one link.
     for agents, links in _iterate_neighbours(graph):
         senders = graph.senders[links]
         own_mean = means[:, agents]

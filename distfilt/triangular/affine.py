@@ -179,7 +179,7 @@ class AffineMap(FrozenModel):
     def _regression(self, y: Array, members: Array) -> Array:
         """Return the regression of x on y, (..., N, d), which broadcasts with the members."""
         centred = y - self.observed_mean[..., None, :]
-        # x̄ + K (y - ȳ).
+        # x̄ + K (y - ȳ); members are rows, so y multiplies Kᵀ. A contiguous copy is faster.
         predicted = self.mean[..., None, :] + centred @ np.ascontiguousarray(
             self.gain.mT
         )
@@ -199,6 +199,7 @@ class AffineMap(FrozenModel):
         """Return members x with S(y, x) = z, (..., N, d); y is (..., N, m), or (..., m) for all."""
         if y.ndim == self.observed_mean.ndim:
             y = y[..., None, :]
+        # L z, with members as rows
         residual = z @ np.ascontiguousarray(self.scale.mT)
         return np.asarray(self._regression(y, z) + residual)
 
@@ -242,7 +243,7 @@ def join_enough_samples(y: Array, x: Array, n_members: int) -> Array:
 
 
 def check_variables(wrong: Mask, m: int, needs: str) -> None:
-    """Raise an error that names the first wrong variable of (..., m + d), y before x.
+    """Raise an error that names the first variable flagged as wrong, of (..., m + d), y before x.
 
     `needs` says in the message how variables have to be. One wrong ensemble of a batch is enough.
     """

@@ -182,7 +182,8 @@ def _average_scales(
 ) -> tuple[Array, Array]:
     """Return the mean and standard deviation of each variable over all agents, (A, m + d) each.
 
-    They are found by consensus from the agents' own samples (A, N, m + d): each has a copy.
+    They are found by consensus from the agents' own samples (A, N, m + d) of m observed and d state
+    variables: each agent has a copy. A constant variable raises an error.
     """
     centre = _average_values(mean(joint), channel, average)
     anomalies = joint - centre[:, None, :]
@@ -190,7 +191,8 @@ def _average_scales(
     std = np.sqrt(_average_values(squares, channel, average))
     # A smaller deviation is rounding of the mean.
     is_constant = std <= 1e-13 * np.abs(centre)
-    check_variables(is_constant, m, "are not constant")
+    # Refuse constant ones: the error names the first, as a column of y or of x.
+    check_variables(is_constant, m, needs="are not constant")
     return centre, std
 
 

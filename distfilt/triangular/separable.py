@@ -343,7 +343,8 @@ def _standardise_samples(y: Array, x: Array) -> tuple[Array, Array, Array]:
     std = np.sqrt(variance)
     # A smaller deviation is rounding of the mean.
     is_constant = std <= 1e-13 * np.abs(centre)
-    check_variables(is_constant, y.shape[-1], "are not constant")
+    # Refuse constant ones: the error names the first, as a column of y or of x.
+    check_variables(is_constant, y.shape[-1], needs="are not constant")
     joint /= std[..., None, :]
     return joint, centre, std
 
@@ -407,7 +408,7 @@ def _fit_component(
     is_step = np.arange(values.shape[-1]) >= 1
     feature_penalty = penalty * is_bump
     value_penalty = penalty * is_step
-    # W = (Psi' Psi / N + D)⁻¹ Psi' Phi / N, with the penalty on the diagonal of D.
+    # W = (Ψᵀ Ψ / N + D)⁻¹ Ψᵀ Φ / N, with the penalty on the diagonal of D.
     normal_matrix = features.mT @ features / n + np.diag(feature_penalty)
     eigenvalues = np.linalg.eigvalsh(normal_matrix)
     smallest = eigenvalues[..., 0]
@@ -419,7 +420,7 @@ def _fit_component(
         )
     regression = np.linalg.solve(normal_matrix, features.mT @ values / n)
     residual = values - features @ regression
-    # Q = R' R / N + W' D W + E for the residuals R = Phi - Psi W, E the penalty of a.
+    # Q = Rᵀ R / N + Wᵀ D W + E for the residuals R = Φ - Ψ W, E the penalty of a.
     quadratic = residual.mT @ residual / n
     weighted = feature_penalty[:, None] * regression
     quadratic = quadratic + regression.mT @ weighted
@@ -467,7 +468,7 @@ def _minimise_nonnegative(quadratic: Array, rates: Array, lower: Array) -> Array
         solution = np.linalg.solve(system, free_gradient[..., None])
         step = -solution[..., 0]
         a = _search_projected(a, step, gradient, quadratic, rates, lower)
-        # The Newton decrement g' H⁻¹ g is about twice the distance of the loss from its minimum,
+        # The Newton decrement gᵀ H⁻¹ g is about twice the distance of the loss from its minimum,
         # before the step. The loss is of the order of one, with a rounding of some 1e-15.
         decrement = -(free_gradient * step).sum(axis=-1)
         if (decrement < 1e-13).all():

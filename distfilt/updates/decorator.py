@@ -188,7 +188,8 @@ def perturb_observations(
     # The members' mean is then not changed by the draws.
     if centred:
         normal -= normal.mean(axis=-2, keepdims=True)
-    # h(x_i) + zeta_i with zeta_i = L xi_i and R = L L'. The sum overwrites the draws.
+    # h(x_i) + ζ_i with ζ_i = L ξ_i and R = L Lᵀ; members are rows, so ξ multiplies Lᵀ, of which a
+    # contiguous copy is faster. The sum overwrites the draws.
     perturbed = normal @ np.ascontiguousarray(cholesky(noise).mT)
     return np.asarray(np.add(perturbed, predicted, out=perturbed))
 

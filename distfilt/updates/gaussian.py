@@ -179,7 +179,7 @@ def enkf_exact(
     joint_anomalies = np.concatenate([anomalies, predicted_anomalies], axis=-1)
     draws = exact_noise(joint_anomalies, cholesky(noise), rng)
     gain = _solve_gain(anomalies, predicted_anomalies, noise)
-    # x_i + K (y* - h(x_i) - zeta_i).
+    # x_i + K (y* - h(x_i) - ζ_i).
     innovations = observed[..., None, :] - predicted - draws
     return np.asarray(ensemble + innovations @ gain)
 
@@ -226,7 +226,7 @@ def etkf(
     mean, anomalies = center_ensemble(ensemble)
     predicted_mean, predicted_anomalies = center_ensemble(predicted)
     gain = _solve_gain(anomalies, predicted_anomalies, noise)
-    # S = U D V', so (I + S S')^(-1/2) = I + U ((1 + D²)^(-1/2) - 1) U'.
+    # S = U D Vᵀ, so (I + S Sᵀ)^(-1/2) = I + U ((1 + D²)^(-1/2) - 1) Uᵀ.
     root = np.linalg.cholesky(noise)
     whitened = np.linalg.solve(root, predicted_anomalies.mT).mT / np.sqrt(n - 1)
     u, sizes, _ = np.linalg.svd(whitened, full_matrices=False)
@@ -308,7 +308,7 @@ def stochastic_forecast(
     # Without noise nothing is drawn.
     if not np.count_nonzero(root):
         return forecast
-    # w_i = L xi_i with Q = L L'.
+    # w_i = L ξ_i with Q = L Lᵀ; members are rows, so ξ multiplies Lᵀ. A contiguous copy is faster.
     normal = rng.standard_normal(forecast.shape)
     return forecast + normal @ np.ascontiguousarray(root.T)
 

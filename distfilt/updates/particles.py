@@ -31,7 +31,7 @@ E = TypeVar("E", bound=np.generic)
 
 
 _FAR = 10
-"""An observation is far from all predictions if its squared distance is so many standard deviations
+"""An observation is far from the predictions if its squared distance is so many standard deviations
 above the mean."""
 
 
@@ -74,9 +74,10 @@ def warn_of_collapse(problem: str, option: str) -> None:
 def warn_of_weights(
     log_weights: Array, predicted: Array, observed: Array, noise: Array
 ) -> None:
-    """Warn if one member has all the weight, or the observation is far from all predictions.
+    """Warn if one member has all the weight, or the observation is far from the predictions.
 
-    Far is ten standard deviations of the squared Mahalanobis distance above its mean.
+    The squared Mahalanobis distance is taken from the mean of an ensemble's predictions, with their
+    covariance plus the noise's. Far is ten of its standard deviations above its mean.
 
     Parameters
     ----------
@@ -111,7 +112,8 @@ def warn_of_weights(
     weights = np.exp(log_weights - log_sum_exp(log_weights))
     # The initial value is for a batch without ensembles.
     smallest_size = size_of(weights).min(initial=np.inf)
-    # An effective size of 1.1 means that one member has 95 % of the weight.
+    # An effective size of 1.1 means that one member has 95 % of the weight. The warning names the
+    # filter's option that helps, rejuvenation.
     if smallest_size < 1.1:
         problem = f"an ensemble's weights have an effective size of {smallest_size:.1f}"
         warn_of_collapse(problem, "rejuvenation=")
@@ -277,7 +279,7 @@ def add_jitter(
     shrunk towards the mean, as in C. Musso, N. Oudjane, F. Le Gland, in: Sequential Monte Carlo
     Methods in Practice (2001) 247-271.
     """
-    # L xi_i with C = L L'.
+    # L ξ_i with C = L Lᵀ.
     noise = normal @ factor(covariance).mT
     if is_copy is not None:
         moved = points + bandwidth * noise
@@ -337,7 +339,7 @@ def log_likelihood(
         both_present = present[..., :, None] & present[..., None, :]
         covariance = np.where(both_present, noise, np.eye(noise.shape[-1]))
         residual = np.where(missing[..., None], 0.0, residual)
-    # -|L⁻¹ r|² / 2 with R = L L': one solve with all particles as right-hand sides.
+    # -|L⁻¹ r|² / 2 with R = L Lᵀ: one solve with all particles as right-hand sides.
     whitened = solve_lower(cholesky(covariance), residual)
     whitened = np.ascontiguousarray(whitened)
     logs = np.asarray(-0.5 * (whitened * whitened).sum(axis=-2))

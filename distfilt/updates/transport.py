@@ -223,7 +223,7 @@ def etpf(
     -----
     ParticleCollapse
         If one member has nearly all the weight, so that the others become its copies, or if the
-        observation is far from all predictions.
+        observation is far from the predictions.
 
     Raises
     ------

@@ -742,7 +742,7 @@ def _whiten(group: Indices, observed: Array, noise: Array) -> list[_Mixture]:
         # A missing one gets a unit variance of its own.
         either = missing[..., :, None] | missing[..., None, :]
         covariance = np.where(either, np.eye(g), covariance)
-    # W = L⁻¹ for R = L L': W R W' = I.
+    # W = L⁻¹ for R = L Lᵀ, so that W R Wᵀ = I.
     whitening = solve_lower(cholesky(covariance), np.eye(g))
     values = np.where(missing, 0.0, observed)
     mixed = (whitening @ values[..., None])[..., 0]

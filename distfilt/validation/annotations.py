@@ -184,13 +184,16 @@ def _check_instance(
 def _check_callable(value: object, name: str, context: CallContext) -> object:
     """Return a function; the options of a partial of a validated function are checked here."""
     if not callable(value):
+        # The message is written where this is caught.
         raise TypeError
     if not isinstance(value, partial):
         return value
+    # A function that is decorated by @validated carries its constraints.
     constraints = getattr(value.func, "signature_constraints", None)
     if constraints is None:
         return value
-    # Nested calls are not checked, so a partial's options are checked here.
+    # The library will call the function, and does not check calls from within: so a partial's
+    # options are checked here.
     options = constraints.validate((), value.keywords)
     return partial(value.func, *value.args, **options)
 

@@ -130,3 +130,21 @@ def test_the_earth_hides_satellites_on_opposite_sides_only() -> None:
     assert occulted(-geo, meo)
     # A line of sight that ends before the Earth is free.
     assert not occulted([42000.0, 0, 0], [8000.0, 0, 0])
+
+
+def test_the_earth_hides_what_points_between_two_satellites_are_inside_it() -> None:
+    """Of random pairs near and far from each other, and in either order."""
+    rng = np.random.default_rng(2)
+    directions = rng.standard_normal((2, 400, 3))
+    # Half of the pairs are almost above each other.
+    directions[1, ::2] = directions[0, ::2] + 0.3 * directions[1, ::2]
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    a, b = directions * rng.uniform(6500, 15000, (2, 400, 1))
+    part = np.linspace(0.0, 1.0, 2001)[:, None, None]
+    least = np.linalg.norm(a + part * (b - a), axis=-1).min(axis=0)
+    # Steps of up to 15 km along a line miss its nearest point by far less than a tenth of a km.
+    is_clear = np.abs(least - orbit.RADIUS) > 0.1
+    expected = least[is_clear] < orbit.RADIUS
+    assert 50 < expected.sum() < is_clear.sum() - 50
+    assert np.array_equal(occulted(a, b)[is_clear], expected)
+    assert np.array_equal(occulted(b, a)[is_clear], expected)
