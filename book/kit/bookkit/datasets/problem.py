@@ -46,11 +46,11 @@ def list_places(
     anchors : DataFrame, optional
         Landmarks, by subject, whose places are known; they are no part of the state.
     """
-    known = [] if anchors is None else list(anchors.index)
+    surveyed = [] if anchors is None else list(anchors.index)
     places = {robot: [3 * k, 3 * k + 1] for k, robot in enumerate(data.robots)}
     first = 3 * len(data.robots)
     for subject in data.landmarks.index:
-        if subject not in known:
+        if subject not in surveyed:
             places[subject] = [first, first + 1]
             first += 2
     return places
@@ -86,20 +86,20 @@ def make_sensors(
     places = list_places(data, anchors=anchors)
     sensors = {}
     for robot in data.robots:
-        own = places[robot]
+        position = places[robot]
         for subject, place in places.items():
             if subject == robot:
                 continue
             if kind == "range":
-                sensor = distance(own, std=std, observer=place)
+                sensor = distance(position, std=std, observer=place)
             else:
-                pose = [*own, own[1] + 1]
+                pose = [*position, position[1] + 1]
                 pair = (place[0], place[1])
                 sensor = range_bearing(pair, std=std, observer=pose)
             sensors[robot, subject] = sensor
         if anchors is not None:
             for subject, place in anchors[["x", "y"]].iterrows():
-                sensors[robot, str(subject)] = distance(own, std=std, origin=place)
+                sensors[robot, str(subject)] = distance(position, std=std, origin=place)
     return sensors
 
 
@@ -176,12 +176,12 @@ def follow_sightings(
         t = dt * step
         if not state.t < t or step > last:
             continue
-        known = [
+        observations = [
             Observation(t, 0, value, sensors[robot, subject])
             for robot, subject, value in sightings
             if subject not in candidates
         ]
-        state = f.step(state, t, [known])
+        state = f.step(state, t, [observations])
         for robot, subject, value in sightings:
             if subject not in candidates:
                 continue
@@ -222,13 +222,13 @@ def score_poses(data: Dataset, times: Array, means: Array, covs: Array) -> pd.Da
     truth = data.true_poses(np.asarray(times)).reshape(len(times), n)
     rows = np.full((len(times), 3), np.nan)
     for k, pose in enumerate(truth):
-        known = np.flatnonzero(~np.isnan(pose))
-        if not known.size:
+        scored = np.flatnonzero(~np.isnan(pose))
+        if not scored.size:
             continue
-        error = means[k][..., known] - pose[known]
-        is_heading = known % 3 == 2
+        error = means[k][..., scored] - pose[scored]
+        is_heading = scored % 3 == 2
         error[..., is_heading] = wrap(error[..., is_heading])
-        cov = covs[k][..., known[:, None], known]
+        cov = covs[k][..., scored[:, None], scored]
         weighted = np.linalg.solve(cov, error[..., None])[..., 0]
         square = error**2
         rows[k] = [
@@ -260,9 +260,9 @@ def score_landmarks(data: Dataset, mean: Array, cov: Array) -> pd.DataFrame:
     error = np.reshape(mean[first:], (-1, 2)) - data.landmarks.to_numpy()
     squares = {}
     for k, (subject, gap) in enumerate(zip(data.landmarks.index, error, strict=True)):
-        own = slice(first + 2 * k, first + 2 * k + 2)
+        place = slice(first + 2 * k, first + 2 * k + 2)
         squares[subject] = {
             "place": gap @ gap,
-            "place_nees": gap @ np.linalg.solve(cov[own, own], gap) / 2,
+            "place_nees": gap @ np.linalg.solve(cov[place, place], gap) / 2,
         }
     return pd.DataFrame(squares).T.rename_axis("subject")

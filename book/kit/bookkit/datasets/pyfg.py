@@ -127,11 +127,11 @@ def _read_line(reader: LineReader, number: int, words: list[str]) -> Line:
             number, f"expected one of {', '.join(_FIELDS)}, got {word!r}{hint}"
         )
     n_names, fields = _FIELDS[word]
-    rest = words[1:]
+    values = words[1:]
     # The time stands before the names; landmarks have none.
     first = 1 if fields.startswith("time") else 0
-    names = rest[first : first + n_names]
-    numbers = rest[:first] + rest[first + n_names :]
+    names = values[first : first + n_names]
+    numbers = values[:first] + values[first + n_names :]
     return number, word, names, reader.numbers(number, numbers, fields)
 
 
@@ -224,9 +224,9 @@ def _join_displacements(events: list[Event]) -> list[Event]:
             joined.append(event)
         else:
             former = joined[before]
-            whole = (*_compose(former[4], values), former[4][3] + values[3])
+            displacement = (*_compose(former[4], values), former[4][3] + values[3])
             total = None if cov is None or former[5] is None else former[5] + cov
-            joined[before] = (time, robot, kind, subject, whole, total)
+            joined[before] = (time, robot, kind, subject, displacement, total)
     return joined
 
 

@@ -274,8 +274,8 @@ class Dataset:
 
     def _list_inputs(self, robot: str) -> tuple[Array, Array]:
         """Return when each input of a robot begins, (N,), and its rates, (N, 3)."""
-        own = self.events[self.events["robot"] == robot]
-        odometry = own[own["kind"] == "odometry"]
+        of_robot = self.events[self.events["robot"] == robot]
+        odometry = of_robot[of_robot["kind"] == "odometry"]
         if len(odometry):
             # Of several inputs at one time the last one holds.
             odometry = odometry.drop_duplicates("time", keep="last")
@@ -284,7 +284,7 @@ class Dataset:
             return odometry["time"].to_numpy(dtype=float), np.insert(
                 values, 1, 0.0, axis=1
             )
-        steps = own[own["kind"] == "displacement"]
+        steps = of_robot[of_robot["kind"] == "displacement"]
         begins: list[float] = []
         inputs: list[list[float]] = []
         rows = steps[["time", *_VALUE_COLUMNS]].to_numpy(dtype=float).tolist()

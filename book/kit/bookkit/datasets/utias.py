@@ -124,21 +124,21 @@ def _read_landmarks(path: Path, subjects: list[str]) -> pd.DataFrame:
 
 def _find_robots(root: Path) -> list[str]:
     """Return the robots' numbers; each must have odometry and measurements."""
-    found: dict[str, set[str]] = {}
+    kinds_by_robot: dict[str, set[str]] = {}
     for path in sorted(root.glob("Robot*_*.dat")):
         # Robot3_Odometry: robot 3, kind Odometry.
         robot, _, kind = path.stem.removeprefix("Robot").partition("_")
-        found.setdefault(robot, set()).add(kind)
-    if not found:
+        kinds_by_robot.setdefault(robot, set()).add(kind)
+    if not kinds_by_robot:
         raise DataError(
             f"{root}: no file Robot1_Odometry.dat, so that no robot is found"
         )
-    for robot, kinds in found.items():
+    for robot, kinds in kinds_by_robot.items():
         for kind in ("Odometry", "Measurement"):
             if kind not in kinds:
                 raise DataError(f"{root / f'Robot{robot}_{kind}.dat'}: no such file")
     # Robot 10 comes after robot 9: shorter names first.
-    return sorted(found, key=lambda robot: (len(robot), robot))
+    return sorted(kinds_by_robot, key=lambda robot: (len(robot), robot))
 
 
 def _read_measurements(
