@@ -171,8 +171,21 @@ def test_a_reset_is_common_knowledge() -> None:
     state = f.reset(state, [1], [0.0], [[1.0]])
     # All agents have the same belief here, and so do the links.
     assert np.allclose(state.link_covariances, state.covariances[0])
+    assert np.allclose(state.link_means, state.means[0])
     with pytest.raises(ValueError, match="^agents must be all of them"):
         f.reset(state, [1], [0.0], [[1.0]], agents=[0])
+    # P⁺⁻¹ = P⁻¹ + Σ Hᵀ R⁻¹ H and P⁺⁻¹ m⁺ = P⁻¹ m + Σ Hᵀ R⁻¹ y, over all agents
+    matrix = np.linalg.inv(state.covariances[0])
+    vector = matrix @ state.means[0]
+    seen = [y[0] for y in observations()]
+    for sensor, y in zip(sensors(), seen, strict=True):
+        weighted = sensor.H(2).T @ np.linalg.inv(sensor.noise_cov)
+        matrix = matrix + weighted @ sensor.H(2)
+        vector = vector + weighted @ y
+    for k, entries in enumerate([seen, *[[None] * 5] * 4]):
+        state = f.step(state, 3.0 + k, entries)
+    assert np.allclose(state.means, np.linalg.solve(matrix, vector), atol=1e-10)
+    assert np.allclose(state.covariances, np.linalg.inv(matrix), atol=1e-10)
 
 
 @pytest.mark.parametrize(

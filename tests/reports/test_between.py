@@ -147,6 +147,41 @@ def test_members_without_noise_are_exact() -> None:
     assert np.allclose(run["variance"].values[-1], variance, atol=1e-9)
 
 
+TURNING = {
+    "gaussian": filters.GaussianFilter,
+    "gaussian, unscented": partial(filters.GaussianFilter, linearization="unscented"),
+    "ensemble": partial(filters.EnsembleFilter.exact, members=200),
+    "particle": partial(filters.ParticleFilter, members=500),
+    "transport": partial(filters.TransportFilter, members=40),
+}
+
+
+@pytest.mark.parametrize("family", TURNING)
+def test_a_heading_between_two_sides_of_the_cut(family: str) -> None:
+    """It crosses ±π between the steps of the late one: as a heading that starts elsewhere."""
+    model = LinearModel.from_transition(
+        2,
+        lambda dt: np.array([[1.0, dt], [0.0, 1.0]]),
+        lambda t, dt: MOTION.Q(t, dt),
+        periods={0: 2 * np.pi},
+    )
+    eye = component([0], std=0.1, periods=[2 * np.pi])
+    f = TURNING[family](model, [eye], lag=4)
+    summaries = []
+    for angle in (0.1, 1.6):
+        start = f.start(([angle, 1.0], 0.02 * np.eye(2)), rng=np.random.default_rng(0))
+        state = f.step(start, 1.0, [[angle + 1.1]])
+        state = f.step(state, 2.0, [[angle + 1.9]])
+        late = Observation(1.4, 0, [angle + 1.2])
+        summaries.append(f.summarize(f.step(state, 2.0, [None], delayed=[late])))
+    level, turned = summaries
+    # The second is turned by 1.5, and lies behind the cut, a whole turn less.
+    assert turned.mean[0, 0] < -2.0
+    shift = [1.5 - 2 * np.pi, 0.0]
+    assert np.allclose(turned.mean[0], level.mean[0] + shift, atol=1e-6)
+    assert np.allclose(turned.variance, level.variance, atol=1e-6)
+
+
 def test_agents_of_a_transport_filter_keep_their_members_in_common() -> None:
     f = filters.TransportFilter(MOTION, [EYE, None], graphs.path(2), members=20, lag=4)
     state = f.start(PRIOR, rng=np.random.default_rng(0))
