@@ -20,11 +20,12 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from .validation import Array, Mask, call_user
+from .validation.checks import refuse_mask
 from .validation.first_use import is_first_use, needs_check
 
 __all__: list[str] = []
@@ -89,9 +90,11 @@ class _Differences:
         rounding = unit * np.abs(self.centre)
         bend = np.abs(self.bend)
         largest_change = np.abs(self.change).max(axis=-1)
+        # One percent of the change over 2 h.
         limit = 1e-2 * largest_change + rounding.max(axis=-1)
         component_is_bent = bend.max(axis=-1) > limit
         steepest = np.abs(self.slope).max(axis=-2, keepdims=True)
+        # The change over 2 h is 2 h times the slope, so that one percent of it is 0.02 h |slope|.
         entry_is_bent = bend > 2e-2 * steepest * self.step[..., None] + rounding
         return np.asarray(component_is_bent[..., None] | entry_is_bent)
 
@@ -138,7 +141,9 @@ def central_difference(
     >>> central_difference(single, np.array([100.0])).round(5)
     array([[0.05]])
     """
-    slope, _ = difference_with_error(function, x, difference, step=step, scale=scale)
+    slope, _error = difference_with_error(
+        function, x, difference, step=step, scale=scale
+    )
     return slope
 
 
@@ -153,16 +158,28 @@ def difference_with_error(
     """Derivative as :func:`central_difference`, and a bound of its rounding error, (..., m, d)."""
     size = np.maximum(1.0, np.abs(x))
     deviation = size if scale is None else np.broadcast_to(scale, x.shape)
-    first, slope, error = _refine_differences(function, x, difference, step)
+    refined = _refine_differences(function, x, difference, step)
+    first = refined.first
     is_long = (first.step > deviation) & (deviation > 0)
     if scale is not None and is_long.any():
-        slope = _shorten_steps(function, x, difference, first, slope, deviation)
-    if _may_be_noisy(first, error, deviation):
-        slope, error = _lengthen_steps(
-            function, x, difference, first, (slope, error), deviation
-        )
+        slope = _shorten_steps(function, x, difference, first, refined.slope, deviation)
+        refined = refined._replace(slope=slope)
+    if _may_be_noisy(first, refined.error, deviation):
+        refined = _lengthen_steps(function, x, difference, refined, deviation)
     # Jacobians have the values first.
-    return np.asarray(slope.mT), np.asarray(error.mT)
+    return np.asarray(refined.slope.mT), np.asarray(refined.error.mT)
+
+
+class _RefinedDifferences(NamedTuple):
+    """Differences over the first step, and slopes (..., d, m) with their errors.
+
+    The slopes are those of the first step, or, where the function bends within it, of one that is a
+    hundred times as short, and so on.
+    """
+
+    first: _Differences
+    slope: Array
+    error: Array
 
 
 def _refine_differences(
@@ -170,36 +187,37 @@ def _refine_differences(
     x: Array,
     difference: Callable[[Array, Array], Array],
     step: float,
-) -> tuple[_Differences, Array, Array]:
+) -> _RefinedDifferences:
     """Take differences over a step, and over shorter steps where the function bends within it.
 
-    `step` is relative to a component's size, or to 1 if that is larger. The first result has the
-    differences of this step. The other two, (..., d, m), are slopes and their errors: of this step,
-    or, where the function bends, of one that is a hundred times as short, and so on.
+    `step` is relative to a component's size, or to 1 if that is larger.
     """
     size = np.maximum(1.0, np.abs(x))
     first = _take_differences(function, x, difference, step * size)
     error = _rounding_error(first, x)
     is_bent = first.is_bent
     if not is_bent.any():
-        return first, first.slope, error
+        return _RefinedDifferences(first, first.slope, error)
     if step <= _SMALLEST_STEP:
         # There is no shorter step that could show whether the bend is curvature or noise, so it
         # counts as an error of the slope.
         bend = np.abs(first.bend) / first.step[..., None]
-        return first, first.slope, np.where(is_bent, np.maximum(error, bend), error)
+        error = np.where(is_bent, np.maximum(error, bend), error)
+        return _RefinedDifferences(first, first.slope, error)
     # The shorter step is refined in the same way.
-    second, finer, finer_error = _refine_differences(
-        function, x, difference, 1e-2 * step
-    )
+    finer = _refine_differences(function, x, difference, 1e-2 * step)
+    second = finer.first
     # A bend that vanishes for a shorter step is curvature: noise looks bent over steps of any size.
     # A change f(x + h) - f(x - h) of exactly zero says nothing, since the shorter step may be below
     # the function's resolution.
     is_straight = ~second.is_bent & (second.change != 0)
     # It may also have vanished only for the steps after that one.
     first.has_curvature = is_bent & (is_straight | second.has_curvature)
-    slope = np.where(is_bent, finer, first.slope)
-    return first, slope, np.where(is_bent, finer_error, error)
+    return _RefinedDifferences(
+        first,
+        slope=np.where(is_bent, finer.slope, first.slope),
+        error=np.where(is_bent, finer.error, error),
+    )
 
 
 def _shorten_steps(
@@ -318,17 +336,17 @@ def _lengthen_steps(
     function: Callable[[Array], Array],
     x: Array,
     difference: Callable[[Array, Array], Array],
-    first: _Differences,
-    result: tuple[Array, Array],
+    refined: _RefinedDifferences,
     deviation: Array,
-) -> tuple[Array, Array]:
+) -> _RefinedDifferences:
     """Return the slopes of the longest steps that agree with all shorter ones, and their errors.
 
     O. V. Lepski's rule, for each entry: a step is too long as soon as its slope differs from a
     shorter step's by more than the rounding of both. Slopes that rounding does not spoil stay.
-    `result` has slopes and errors (..., d, m) of the step `first`, or of shorter ones.
     """
-    slope, error = result
+    first = refined.first
+    slope = refined.slope
+    error = refined.error
     size = np.maximum(1.0, np.abs(x))
     # The longest step is half a standard deviation. For functions in single precision and small
     # deviations it is a hundredth of the component's size, or rounding would decide. A component
@@ -365,12 +383,14 @@ def _lengthen_steps(
         error = np.where(agrees, bound, error)
         if not agrees.any() or _is_accurate(slope, error, deviation):
             break
-    return _restore_close(result[0], slope, deviation), error
+    slope = _restore_close(refined.slope, slope, deviation)
+    return _RefinedDifferences(first, slope, error)
 
 
 def _is_accurate(slope: Array, error: Array, deviation: Array) -> bool:
     """Whether the errors of all slopes are at most a hundredth of a negligible one."""
     row = _largest_in_row(slope, deviation)
+    # An error times the state's deviation is an error of the value.
     is_accurate = error * deviation[..., None] <= 1e-2 * _NEGLIGIBLE * row
     return bool(is_accurate.all())
 
@@ -470,7 +490,7 @@ def evaluate_derivative(
                     f"{name} has no usable differences: its derivative over two steps differs, "
                     "by rounding or since it is not smooth; give derivative=",
                     RuntimeWarning,
-                    4,
+                    stacklevel=4,
                 )
         return slope
     slope = call_derivative(owner.derivative, args, shape)
@@ -478,7 +498,7 @@ def evaluate_derivative(
         warnings.warn(
             "derivative does not match finite differences of its function",
             RuntimeWarning,
-            4,
+            stacklevel=4,
         )
     return slope
 
@@ -494,7 +514,9 @@ def call_derivative(
     (3, 2, 2)
     """
     copies = [x.copy() if type(x) is np.ndarray else x for x in args]
-    slope = np.asarray(call_user(derivative, *copies))
+    result = call_user(derivative, *copies)
+    refuse_mask(result, "derivative")
+    slope = np.asarray(result)
     if slope.shape == shape:
         return slope
     # One matrix for all states.
@@ -535,7 +557,7 @@ def _contradicts(
     `differences` and `static` are those of :func:`evaluate_derivative`.
     """
     reference, error = differences(step=_STEP)
-    coarse, _ = differences(step=4 * _STEP)
+    coarse, _coarse_error = differences(step=4 * _STEP)
     is_wrong = _find_wrong(slope, reference, coarse, error, static)
     if not is_wrong.any():
         return False
@@ -558,6 +580,7 @@ def _find_wrong(
     row_size = np.abs(reference - static).max(axis=-1, keepdims=True)
     step_error = np.abs(reference - other).max(axis=-1, keepdims=True)
     rounding = error.max(axis=-1, keepdims=True)
+    # Differences of two steps that agree to one percent do not depend on the step.
     is_reliable = step_error <= 1e-2 * row_size + rounding
     # A tenth of the row is allowed, for approximate derivatives, and a small part of the largest
     # row: a derivative may leave out a small effect.

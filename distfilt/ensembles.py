@@ -16,7 +16,7 @@ from .linalg import (
     equal_weights,
     factor,
     lower_root,
-    solve_upper,
+    solve_lower,
     symmetrise,
 )
 from .validation import (
@@ -110,7 +110,7 @@ def sample_covariance(ensemble: Ensemble) -> Array:
            [4., 8.]])
     """
     # P = Aᵀ A / (N - 1) of the anomalies A.
-    anomalies = center_ensemble(ensemble)[1]
+    anomalies = center_ensemble(ensemble).anomalies
     n = anomalies.shape[-2]
     return symmetrise(anomalies.swapaxes(-1, -2) @ anomalies / (n - 1))
 
@@ -180,7 +180,7 @@ def match_moments(
         )
     # Kᵀ Rᵀ = U Σ Vᵀ, and the new anomalies are √(N-1) Q V Uᵀ Kᵀ.
     upper = cholesky(cov / (std[..., :, None] * std[..., None, :])).mT
-    u, _, vh = np.linalg.svd(upper @ r.mT)
+    u, _singular_values, vh = np.linalg.svd(upper @ r.mT)
     rotation = vh.mT @ (u.mT @ upper)
     anomalies = q @ (np.sqrt(n - 1) * rotation)
     # Q is centred to rounding only, which counts where the old ensemble is almost flat.
@@ -228,7 +228,7 @@ def exact_noise(avoid: Array, root: Array, rng: Rng) -> Array:
     >>> sample_covariance(noise).round(12)
     array([[4.  , 1.  ],
            [1.  , 1.25]])
-    >>> bool((abs(center_ensemble(x)[1].T @ noise) < 1e-11).all())
+    >>> bool((abs(center_ensemble(x).anomalies.T @ noise) < 1e-11).all())
     True
     """
     n = avoid.shape[-2]
@@ -250,7 +250,7 @@ def _drop_null_columns(root: Array) -> Array:
     std = np.sqrt((root**2).sum(axis=-1))
     unit = np.where(std > 0, std, 1.0)[..., None]
     # Singular values count if their squares exceed the rounding of the covariance.
-    u, s, _ = np.linalg.svd(root / unit)
+    u, s, _vh = np.linalg.svd(root / unit)
     largest = s.max(axis=-1, initial=0.0, keepdims=True)
     is_positive = s**2 > 64 * s.shape[-1] * EPS * largest**2
     rank = int(is_positive.sum(axis=-1).max(initial=0))
@@ -265,7 +265,7 @@ def _project_out(noise: Array, avoid: Array) -> Array:
     Raises an error if there are too few members for r columns that are independent of those.
     """
     n, rank = noise.shape[-2:]
-    anomalies = center_ensemble(avoid)[1]
+    anomalies = center_ensemble(avoid).anomalies
     length = np.sqrt((anomalies**2).sum(axis=-2, keepdims=True))
     unit_columns = anomalies / np.where(length > 0, length, 1.0)
     basis, independent = _orthonormal_basis(unit_columns)
@@ -277,7 +277,7 @@ def _project_out(noise: Array, avoid: Array) -> Array:
         )
     # Twice, since rounding leaves a small projection the first time.
     for _ in range(2):
-        noise = center_ensemble(noise - basis @ (basis.mT @ noise))[1]
+        noise = center_ensemble(noise - basis @ (basis.mT @ noise)).anomalies
     return noise
 
 
@@ -294,7 +294,7 @@ def _orthonormal_basis(columns: Array) -> tuple[Array, int]:
     # and make the draw depend on the last bit. The singular values of R are those of the columns
     # and show their rank reliably; with R = U S Vᵀ the basis is Q U.
     if not is_independent.all():
-        u, values, _ = np.linalg.svd(r, full_matrices=False)
+        u, values, _vh = np.linalg.svd(r, full_matrices=False)
         largest = values.max(axis=-1, initial=0.0, keepdims=True)
         is_independent = values > columns.shape[-2] * EPS * largest
         q = q @ u
@@ -316,7 +316,9 @@ def _set_covariance(noise: Array, root: Array) -> Array:
         lower = cholesky(transposed @ noise / (n - 1))
         pivots = np.diagonal(lower, axis1=-2, axis2=-1)
         if pivots.min(initial=1.0) >= _SAFE_PIVOT:
-            return np.asarray(noise @ solve_upper(lower, transposed_root))
+            # C⁻ᵀ Lᵀ
+            transform = solve_lower(lower, transposed_root, transposed=True)
+            return np.asarray(noise @ transform)
     # With a small pivot, or none, the solution would lose digits. Z = Q R loses none:
     # √(N-1) Q has the identity as sample covariance too.
     q, r = np.linalg.qr(noise)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,16 +34,23 @@ class SolverError(RuntimeError):
     """A solver stopped without a solution; the message names it, its status and the problem."""
 
 
-def center_ensemble(members: Array) -> tuple[Array, Array]:
-    """Mean (..., 1, d) and anomalies (..., N, d) of rows (..., N, d): members minus their mean.
+class CenteredEnsemble(NamedTuple):
+    """Mean (..., 1, d) and anomalies (..., N, d) of an ensemble: members minus their mean."""
 
-    >>> center_ensemble(np.array([[1.0], [3.0]]))
-    (array([[2.]]), array([[-1.],
-           [ 1.]]))
+    mean: Array
+    anomalies: Array
+
+
+def center_ensemble(members: Array) -> CenteredEnsemble:
+    """Subtract the mean from members (..., N, d).
+
+    >>> center_ensemble(np.array([[1.0], [3.0]])).anomalies
+    array([[-1.],
+           [ 1.]])
     """
     # A product with equal weights: ten times faster than a reduction over a short inner axis.
     mean = equal_weights(members.shape[-2]) @ members
-    return mean, members - mean
+    return CenteredEnsemble(mean, members - mean)
 
 
 @lru_cache(maxsize=16)
@@ -221,24 +229,22 @@ def solve_lower(lower: Array, right: Array, *, transposed: bool = False) -> Arra
     return solution.reshape(*leading, d, k)
 
 
-def solve_upper(lower: Array, right: Array) -> Array:
-    """Solve Lᵀ x = b, (..., d, k), with the *lower* triangular factor L (..., d, d)."""
-    return solve_lower(lower, right, transposed=True)
-
-
 def solve_definite(matrix: Array, right: Array) -> Array:
     """Solve with symmetric positive definite matrices, (..., m, m) and (..., m, k)."""
     m, k = right.shape[-2:]
     if matrix.size == m * m and right.size == m * k > 0:
         # LAPACK itself takes a third of numpy's time for one system.
-        _, solution, failed = dposv(matrix.reshape(m, m), right.reshape(m, k), lower=1)
+        _factor, solution, failed = dposv(
+            matrix.reshape(m, m), right.reshape(m, k), lower=1
+        )
         if not failed:
             return np.asarray(solution.reshape(right.shape))
     elif _has_many_small_systems(matrix, right):
         # P = L Lᵀ, so P⁻¹ b = L⁻ᵀ L⁻¹ b. A matrix that is indefinite by rounding has no factor.
         with suppress(np.linalg.LinAlgError):
             lower = cholesky(matrix)
-            return solve_upper(lower, solve_lower(lower, right))
+            half = solve_lower(lower, right)
+            return solve_lower(lower, half, transposed=True)
     # LU decomposition, which needs no definite matrix.
     return np.asarray(np.linalg.solve(matrix, right))
 
@@ -383,12 +389,20 @@ def deviations(cov: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
 
-def to_unit_variances(cov: Array) -> tuple[Array, Array]:
-    """Return correlations P_ij / (s_i s_j) of covariances, (..., d, d), and the deviations s.
+class ScaledCovariance(NamedTuple):
+    """Correlations P_ij / (s_i s_j) of covariances, (..., d, d), and the deviations s (..., d)."""
 
-    A constant, whose deviation is zero, is left as it is: its s (..., d) is 1.
+    correlation: Array
+    deviation: Array
+
+
+def to_unit_variances(cov: Array) -> ScaledCovariance:
+    """Scale covariances (..., d, d) to unit variances.
+
+    A constant, whose deviation is zero, is left as it is: its s is 1.
     """
     # A variance may be negative by rounding.
     std = np.sqrt(np.abs(np.diagonal(cov, axis1=-2, axis2=-1)))
     scale = np.where(std > 0, std, 1.0)
-    return cov / (scale[..., :, None] * scale[..., None, :]), scale
+    correlation = cov / (scale[..., :, None] * scale[..., None, :])
+    return ScaledCovariance(correlation, scale)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
         """The parts of a model that are used here, in a layer below the models."""
 
         @property
-        def periods(self) -> Any: ...
+        def periods(self) -> object: ...
         @property
         def names(self) -> Sequence[str]: ...
         def step(self, x: Array, t: float, dt: float) -> Array: ...
@@ -335,7 +335,11 @@ def check_transition(model: _Model, x: Array, t: float, dt: float) -> None:
 
 
 def check_sensor(
-    sensor: _Sensor, model: _Model, states: Array, previous: Array | None = None
+    sensor: _Sensor,
+    model: _Model,
+    states: Array,
+    previous: Array | None = None,
+    observed: Array | None = None,
 ) -> None:
     """Refuse a sensor whose observation of a circular component lacks a period, once.
 
@@ -344,26 +348,58 @@ def check_sensor(
     sensor, model
         The model has circular components.
     states, previous : ndarray, (..., N, d)
+    observed : ndarray, (..., m), optional
+        Observations, of which a sensor that is a likelihood gives the density.
     """
     key = f"periods of model {id(model)}"
     if not needs_check(sensor, key):
         return
+    evaluate = getattr(sensor, "evaluate", None)
+    if evaluate is not None and (observed is None or np.isnan(observed).all()):
+        return
     mark_checked(sensor, key)
     x = states.mean(axis=-2)
     args = () if previous is None else (previous.mean(axis=-2),)
-    before = sensor.predict(x, *args)
     places, p = _find_circular(cast(Periods, model.periods))
     for place, period in zip(places, p, strict=True):
         turned = x.copy()
         turned[..., place] += period
+        name = name_component(model, place)
+        if evaluate is not None:
+            _check_likelihood(evaluate, sensor.kind, x, turned, observed, name)
+            if getattr(sensor, "moments", None) is None:
+                continue
+        before = sensor.predict(x, *args)
         change = np.abs(sensor.residual(sensor.predict(turned, *args), before))
         # NaN, where the sensor cannot see, is no change.
         if (change > _SAME * (1 + np.abs(before))).any():
             raise ValueError(
                 f"sensors must have periods= where they measure circular components, got one "
                 f"of kind {sensor.kind!r} that changes by {np.nanmax(change):.4g} when component "
-                f"{name_component(model, place)} turns once"
+                f"{name} turns once"
             )
+
+
+def _check_likelihood(
+    evaluate: Callable[..., Array],
+    kind: str,
+    x: Array,
+    turned: Array,
+    observed: Array | None,
+    name: str,
+) -> None:
+    """Refuse a likelihood that differs for states (..., d) and those that have turned once."""
+    before = evaluate(x, observed)
+    after = evaluate(turned, observed)
+    with np.errstate(invalid="ignore"):
+        # Two that are impossible, minus infinity, do not differ.
+        change = np.abs(after - before)
+    if (change > _SAME * (1 + np.abs(before))).any():
+        raise ValueError(
+            f"sensors must have the same log_likelihood for the same direction, got one of "
+            f"kind {kind!r} that changes by {np.nanmax(change):.4g} when component {name} turns "
+            "once: let it take differences of angles by wrap"
+        )
 
 
 def name_component(model: _Model, place: int) -> str:
@@ -413,21 +449,21 @@ def warn_of_wrapping(
         f"both sides of the cut at t = {t + dt:g} s, where its mean is wrong: declare the "
         f"circular component, Model(..., periods={{{place}: {period}}})",
         RuntimeWarning,
-        4,
+        stacklevel=4,
     )
 
 
-def warn_of_wrapped_truth(f: Any, mean: Array, truth: Array) -> None:
+def warn_of_wrapped_truth(model: _Model, mean: Array, truth: Array) -> None:
     """Warn once if estimates run on where the truth wraps, or the other way round.
 
     Parameters
     ----------
-    f : Filter
-        Its model declares no periods, but its sensors wrap.
+    model : Model
+        It declares no periods, but the filter's sensors wrap.
     mean : ndarray, (T, *runs, A, d)
     truth : ndarray, (T, *runs, 1 or A, d)
     """
-    if not getattr(f, "lacks_periods", False) or len(mean) < 2:
+    if len(mean) < 2:
         return
     with np.errstate(invalid="ignore"):
         error = mean - truth
@@ -443,14 +479,14 @@ def warn_of_wrapped_truth(f: Any, mean: Array, truth: Array) -> None:
         steps = [np.abs(np.diff(values, axis=0)) for values in (mean, truth)]
         is_leap = np.maximum(*steps) > np.pi
     found = np.argwhere(is_turn & is_leap & is_close)
-    if not len(found) or not needs_check(f.model, "truth"):
+    if not len(found) or not needs_check(model, "truth"):
         return
-    mark_checked(f.model, "truth")
+    mark_checked(model, "truth")
     place = int(found[0][-1])
     warnings.warn(
-        f"truth and estimates of component {name_component(f.model, place)} differ by whole "
+        f"truth and estimates of component {name_component(model, place)} differ by whole "
         "turns: one of them wraps and the other runs on; declare the circular component, "
         f"Model(..., periods={{{place}: 2π}})",
         RuntimeWarning,
-        4,
+        stacklevel=4,
     )

@@ -25,7 +25,7 @@ def _transpose(a: np.ndarray) -> np.ndarray:
 
 def _solve(cov: np.ndarray, right: np.ndarray) -> np.ndarray:
     lower = linalg.cholesky(cov)
-    return linalg.solve_upper(lower, linalg.solve_lower(lower, right))
+    return linalg.solve_lower(lower, linalg.solve_lower(lower, right), transposed=True)
 
 
 def _length(cov: np.ndarray, vector: np.ndarray) -> np.ndarray:
@@ -144,7 +144,7 @@ def test_triangular_solves_of_every_number_of_systems(
     is_close = partial(np.allclose, rtol=1e-11, atol=1e-11)
     for solve, matrix in (
         (linalg.solve_lower, lower),
-        (linalg.solve_upper, _transpose(lower)),
+        (partial(linalg.solve_lower, transposed=True), _transpose(lower)),
     ):
         # A solution for each system
         solution = solve(lower, right)

@@ -173,7 +173,7 @@ def align_each(rule: Update) -> Update:
     """Return an update that gets each prediction of an angle near the observation by itself."""
 
     @wraps_update(rule)
-    def aligned(
+    def update_aligned(
         ensemble: np.ndarray,
         predicted: np.ndarray,
         observed: np.ndarray,
@@ -184,8 +184,8 @@ def align_each(rule: Update) -> Update:
         return np.asarray(rule(ensemble, predicted, observed, noise, rng=rng))
 
     # The tag by which a filter aligns predictions one by one, as for likelihoods
-    vars(aligned)["weights_members"] = True
-    return aligned
+    vars(update_aligned)["weights_members"] = True
+    return update_aligned
 
 
 @update

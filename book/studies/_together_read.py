@@ -319,3 +319,83 @@ def least_work(name: str, budget: float = np.inf, runs: Runs = ALL) -> float:
     limit = best(name, budget, runs).error.mean() * 1.1**2
     close = [r for r in admissible(name, budget, runs) if r.error.mean() <= limit]
     return min(count_operations(p, r.cell) for r in close)
+
+
+# ------------------------------------------------------------------------- names and pictures
+
+SHORT_EXCHANGES = {
+    TO_CENTRE.rpartition(", ")[2]: "centre",
+    "then means (diffusion)": "diffusion",
+    "summed on a spanning tree": "tree",
+}
+"""Short names of rules of exchange, for the labels of pictures."""
+
+
+def format_ratio(i: Interval) -> str:
+    """Return a ratio with its interval as a text.
+
+    Examples
+    --------
+    >>> format_ratio(Interval(0.5, 0.25, 0.75, 0.1))
+    '0.500 [0.250, 0.750]'
+    """
+    return f"{i.estimate:.3f} [{i.low:.3f}, {i.high:.3f}]"
+
+
+def short_name(cell: str) -> str:
+    """Return a filter and its exchange in a few words, for pictures.
+
+    Examples
+    --------
+    >>> short_name("ekf_tree")
+    'extended: tree'
+    """
+    kind = CELLS[cell].family.rpartition(", ")[2]
+    exchange = CELLS[cell].exchange.rpartition(", ")[2]
+    return f"{kind}: {SHORT_EXCHANGES.get(exchange, exchange)}"
+
+
+@cache
+def stored_sizes() -> Any:
+    """Return the stored sweep over members and agents, which is read once."""
+    return studies.stored("together", "sizes")
+
+
+def sweep_result(
+    name: str, kind: str, number: int, cell: str
+) -> tuple[Interval, Result]:
+    """Return a cell of the sweep over members or agents: error over the reference's, and result.
+
+    `kind` is "members" or "agents". All numbers of members have one reference; with more
+    agents there are more observations, so that each number of agents has its own.
+    """
+    stored = stored_sizes()
+    name_of_reference = f"{name}_{kind}_reference"
+    if kind == "agents":
+        name_of_reference = f"{name}_{kind}_{number}_reference"
+    swept = result(stored, f"{name}_{kind}_{number}_{cell}", cell)
+    return ratio(swept, result(stored, name_of_reference)), swept
+
+
+def draw_sweep(
+    ax: Any, x: Iterable[float], intervals: Iterable[Interval], k: int, cell: str
+) -> None:
+    """Draw a cell's errors over a sweep, with their intervals, cut off at six."""
+    from bookkit import plotting
+
+    intervals = list(intervals)
+    low, estimate, high = (
+        np.minimum([getattr(i, bound) for i in intervals], 6)
+        for bound in ("low", "estimate", "high")
+    )
+    ax.errorbar(
+        list(x),
+        estimate,
+        yerr=[estimate - low, high - estimate],
+        marker="o",
+        ms=3,
+        lw=1.2,
+        color=plotting.colour(k),
+        ls=plotting.line_style(k),
+        label=short_name(cell),
+    )

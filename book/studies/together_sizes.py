@@ -15,8 +15,6 @@ import _together as together
 
 NAME = "sizes"
 PAPER = "together"
-# Half of the runs of the main table, as there are many sizes
-RUNS = 100
 MEMBERS = (10, 30, 100, 300)
 # Members of ensembles, of particle filters and of transport
 SIZED = ("known_flood", "root_flood", "exact_ci", "pf_flood", "pf_agreed", "ot_young")
@@ -63,7 +61,8 @@ parameters = {
     "program": together.program_digest(),
 }
 # Seeds of their own: these runs are in no other study.
-seeds = np.random.SeedSequence(together.STUDY["seed"] + 1).spawn(RUNS // together.BATCH)
+n_batches = together.STUDY["runs"] // together.BATCH
+seeds = np.random.SeedSequence(together.STUDY["seed"] + 1).spawn(n_batches)
 scenarios = (
     *(together.problem(p).scenario for p in ("linear", "range", "lorenz")),
     together.STUDY,

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
@@ -269,21 +269,23 @@ def retract(
     # Indices of the states that have not converged: only they take part.
     active = np.arange(len(x))
     for _ in range(_STEPS):
-        slope, error = _relative_residual(constraint, x[active], residual[active])
+        slope = constraint.jacobian(x[active])
+        error = _relative_error(constraint, x[active], residual[active], slope)
         is_unsolved = error > _TOLERANCE
         active = active[is_unsolved]
         if not active.size:
             break
         step = _normal_step(slope[is_unsolved], residual[active])
-        x[active], residual[active], has_decreased = _line_search(
-            constraint, x[active], residual[active], step
-        )
+        search = _line_search(constraint, x[active], residual[active], step)
+        x[active] = search.states
+        residual[active] = search.residuals
         # Where g is large its rounding ends the descent above the tolerance, but not far above: a
         # state whose residual is tolerable and decreases no more has arrived.
         is_tolerable = error[is_unsolved] <= _TOLERABLE
-        active = active[has_decreased | ~is_tolerable]
+        active = active[search.has_decreased | ~is_tolerable]
     else:
-        error = _relative_residual(constraint, x[active], residual[active])[1]
+        slope = constraint.jacobian(x[active])
+        error = _relative_error(constraint, x[active], residual[active], slope)
         active = active[error > _TOLERANCE]
     if active.size:
         raise SolverError(
@@ -295,20 +297,19 @@ def retract(
     return np.asarray(x.reshape(states.shape))
 
 
-def _relative_residual(
-    constraint: Constraint, x: Array, residual: Array
-) -> tuple[Array, Array]:
-    """Return Jacobians (n, s, d) at states x (n, d), and each state's largest relative residual.
+def _relative_error(
+    constraint: Constraint, x: Array, residual: Array, slope: Array
+) -> Array:
+    """Return the largest relative residual (n,) of each state x (n, d), with Jacobians (n, s, d).
 
     The residuals (n, s) are taken relative to the magnitude of g_i, of which rounding is a part ε.
     """
-    slope = constraint.jacobian(x)
     # Rounding of x alone changes g_i by up to ε |∇g_i| |x|.
     state_unit = np.linalg.norm(slope, axis=-1) * np.linalg.norm(x, axis=-1)[:, None]
     unit = np.maximum(np.abs(constraint.value), state_unit)
     # A residual of zero is exact, even where its unit is zero too.
     error = np.abs(residual) / np.where(residual == 0, 1.0, unit)
-    return slope, error.max(axis=-1)
+    return np.asarray(error.max(axis=-1))
 
 
 def _normal_step(slope: Array, residual: Array) -> Array:
@@ -332,13 +333,21 @@ def _normal_step(slope: Array, residual: Array) -> Array:
     return np.asarray(-(slope.mT @ multipliers)[..., 0])
 
 
+class _LineSearch(NamedTuple):
+    """States (n, d) after a line search, their residuals (n, s), and which decreased, (n,)."""
+
+    states: Array
+    residuals: Array
+    has_decreased: Mask
+
+
 def _line_search(
     constraint: Constraint, x: Array, residual: Array, step: Array
-) -> tuple[Array, Array, Mask]:
+) -> _LineSearch:
     """Halve each state's step until its residual decreases.
 
-    States and steps are (n, d), residuals (n, s). Returns the new states, their residuals, and
-    whether these have decreased (n,); a state whose residual does not stays where it is.
+    States and steps are (n, d), residuals (n, s). A state whose residual does not decrease stays
+    where it is.
     """
     before = np.linalg.norm(residual, axis=-1)
     has_decreased = np.zeros(len(x), dtype=bool)
@@ -356,7 +365,7 @@ def _line_search(
         has_decreased[rows[is_smaller]] = True
         if has_decreased.all():
             break
-    return new_x, new_residual, has_decreased
+    return _LineSearch(new_x, new_residual, has_decreased)
 
 
 def _make_tangent(x: Array, constraint: Constraint, motion: Motion) -> None:

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from ..validation import (
     ArrayInput,
     Bounds,
     FrozenModel,
+    Indices,
     PositiveFloat,
     Probabilities,
     import_optional,
@@ -183,10 +184,8 @@ def transport_plan(
     a, b = _normalize_masses(rows, columns, cost.shape[1])
     solve = solver_of(solver, regularisation)
     if solver == "entropic":
-        matrix, potential = _solve_allowed(cost, a, b, solve)
-        return _certify(cost, a, b, matrix, potential)
-    matrix, potential = _solve_on_support(cost, a, b, solve)
-    plan = _certify(cost, a, b, matrix, potential)
+        return _certify(cost, a, b, _solve_allowed(cost, a, b, solve))
+    plan = _certify(cost, a, b, _solve_on_support(cost, a, b, solve))
     return _improve(plan, cost, a, b, solve)
 
 
@@ -201,8 +200,29 @@ def _normalize_masses(
     return rows / rows.sum(), column_masses
 
 
-def scale_cost(cost: Array, limit: float | None = None) -> tuple[Array, float, float]:
-    """Return the cost (N, M) scaled to lie between zero and one, its minimum and its range.
+class Solution(NamedTuple):
+    """A solver's plan (N, M), and the potentials (M,) of the columns in units of the cost."""
+
+    plan: Array
+    column_potential: Array
+
+
+class ScaledCost(NamedTuple):
+    """A cost (N, M) scaled to lie between zero and one: cost = minimum + scale * scaled."""
+
+    scaled: Array
+    minimum: float
+    scale: float
+
+    def potential_of_cost(self, potential: Array) -> Array:
+        """Return potentials (M,) of the cost itself, given those of the scaled cost."""
+        # If f_i + g_j <= c'_ij for the scaled costs c', then c = minimum + scale c' has the
+        # potentials scale f and minimum + scale g.
+        return self.minimum + self.scale * potential
+
+
+def scale_cost(cost: Array, limit: float | None = None) -> ScaledCost:
+    """Scale the cost (N, M) to lie between zero and one.
 
     With a limit the range is up to there, and larger costs remain larger than one.
     """
@@ -211,7 +231,7 @@ def scale_cost(cost: Array, limit: float | None = None) -> tuple[Array, float, f
     scale = largest - minimum
     # A constant cost has no range, and any coupling is optimal.
     divisor = scale if scale > 0 else 1.0
-    return (cost - minimum) / divisor, minimum, scale
+    return ScaledCost((cost - minimum) / divisor, minimum, scale)
 
 
 def _cost_on_support(cost: Array, a: Array, b: Array) -> Array:
@@ -221,43 +241,35 @@ def _cost_on_support(cost: Array, a: Array, b: Array) -> Array:
 
 def _solve_on_support(
     cost: Array, a: Array, b: Array, solve: Solve, limit: float | None = None
-) -> tuple[Array, Array]:
+) -> Solution:
     """Solve for the rows and columns with mass, with their costs scaled for the solver.
 
     The unit of the scaled costs is their range: up to the limit, if there is one, above which costs
-    are larger than one. Returns the plan (N, M), and the columns' potentials (M,) in the units of
-    the cost, zero for those without mass.
+    are larger than one. The potentials of columns without mass are zero.
     """
     rows = np.flatnonzero(a)
     columns = np.flatnonzero(b)
-    scaled_cost, minimum, scale = scale_cost(_cost_on_support(cost, a, b), limit)
-    part, g = solve(scaled_cost, a[rows], b[columns])
-    matrix = np.zeros(cost.shape)
-    matrix[np.ix_(rows, columns)] = part
-    # If f_i + g_j <= c'_ij for the scaled costs c', then c = minimum + scale c' has the potentials
-    # scale f and minimum + scale g.
+    supported = scale_cost(_cost_on_support(cost, a, b), limit)
+    part = solve(supported.scaled, a[rows], b[columns])
+    plan = np.zeros(cost.shape)
+    plan[np.ix_(rows, columns)] = part.plan
     potential = np.zeros(cost.shape[1])
-    potential[columns] = minimum + scale * g
-    return matrix, potential
+    potential[columns] = supported.potential_of_cost(part.column_potential)
+    return Solution(plan, potential)
 
 
-def _solve_allowed(
-    cost: Array, a: Array, b: Array, solve: Solve
-) -> tuple[Array, Array]:
-    """Solve the entropic problem with the range of the links that are not forbidden.
-
-    Returns the plan and the columns' potentials, as :func:`_solve_on_support` does.
-    """
+def _solve_allowed(cost: Array, a: Array, b: Array, solve: Solve) -> Solution:
+    """Solve the entropic problem with the range of the links that are not forbidden."""
     limit = _largest_allowed(_cost_on_support(cost, a, b))
     if limit is not None:
         try:
-            matrix, potential = _solve_on_support(cost, a, b, solve, limit)
+            solution = _solve_on_support(cost, a, b, solve, limit)
         except SolverError:
             # There is no plan without the forbidden links.
             limit = None
         else:
-            if not matrix[cost > limit].any():
-                return matrix, potential
+            if not solution.plan[cost > limit].any():
+                return solution
     # All links count if there are no forbidden ones, or if the plan cannot do without.
     return _solve_on_support(cost, a, b, solve)
 
@@ -309,12 +321,12 @@ def _improve(
         if is_optimal or limit >= supported.max():
             break
         cut_cost = np.minimum(cost, limit)
-        matrix, potential = _solve_on_support(cut_cost, a, b, solve)
-        if matrix[cost > limit].any():
+        solution = _solve_on_support(cut_cost, a, b, solve)
+        if solution.plan[cost > limit].any():
             # The plan needs dearer links.
             limit = minimum + 1e3 * (limit - minimum)
             continue
-        trial = _certify(cost, a, b, matrix, potential)
+        trial = _certify(cost, a, b, solution)
         if not trial.duality_gap < plan.duality_gap:
             break
         plan = trial
@@ -339,24 +351,24 @@ def _check_gap(plan: TransportPlan, minimum: float, a: Array, b: Array) -> None:
         )
 
 
-def _certify(cost: Array, a: Array, b: Array, matrix: Array, g: Array) -> TransportPlan:
+def _certify(cost: Array, a: Array, b: Array, solution: Solution) -> TransportPlan:
     """Return the plan with potentials that are feasible whatever the solver's were.
 
-    Given the plan `matrix` (N, M) and the columns' potentials `g` (M,), the largest feasible f and
-    then the largest feasible g are taken: the best bound that can be had from them.
+    Given the columns' potentials g (M,), the largest feasible f and then the largest feasible g are
+    taken: the best bound that can be had from them.
     """
     # A solver leaves out columns without mass; their potentials have no meaning.
-    g = np.where(b > 0, g, -np.inf)
+    g = np.where(b > 0, solution.column_potential, -np.inf)
     # f_i = min_j (c_ij - g_j), then g_j = min_i (c_ij - f_i): f_i + g_j <= c_ij.
     f = (cost - g).min(axis=1)
     g = (cost - f[:, None]).min(axis=0)
-    value = float((matrix * cost).sum())
+    value = float((solution.plan * cost).sum())
     bound = float(f @ a + g @ b)
-    return TransportPlan.construct(matrix, value, (f, g), bound)
+    return TransportPlan.construct(solution.plan, value, (f, g), bound)
 
 
-Solve = Callable[[Array, Array, Array], tuple[Array, Array]]
-"""``solve(cost, rows, columns) -> (matrix, column potential)`` for a cost between zero and one."""
+Solve = Callable[[Array, Array, Array], Solution]
+"""``solve(cost, row_masses, column_masses)`` for a cost between zero and one."""
 
 
 def solver_of(name: Solver, regularisation: float = 0.01) -> Solve:
@@ -366,29 +378,27 @@ def solver_of(name: Solver, regularisation: float = 0.01) -> Solve:
     return _solve_network
 
 
-def _solve_network(cost: Array, a: Array, b: Array) -> tuple[Array, Array]:
-    """Solve by POT's network simplex; return the plan (N, M) and the columns' potentials (M,).
+def _solve_network(cost: Array, a: Array, b: Array) -> Solution:
+    """Solve by POT's network simplex.
 
     It is called directly: `ot.emd` around it would take 0.2 ms more, half as much as the solution
     at N = 50.
     """
     emd = import_optional("ot.lp.emd_wrap", "maps")
-    # Returns plan, cost, row potentials, column potentials, status; the last argument is its
-    # number of threads.
-    matrix, _, _, g, status = emd.emd_c(a, b, np.ascontiguousarray(cost), _PIVOTS, 1)
+    plan, _value, _row_potential, column_potential, status = emd.emd_c(
+        a, b, np.ascontiguousarray(cost), max_iter=_PIVOTS, numThreads=1
+    )
     # In POT's solver 1 means optimal.
     if status != 1:
         raise SolverError(f"network simplex: stopped with status {status}")
-    return np.asarray(matrix), np.asarray(g)
+    return Solution(np.asarray(plan), np.asarray(column_potential))
 
 
-def _solve_entropic(
-    cost: Array, a: Array, b: Array, strength: float
-) -> tuple[Array, Array]:
+def _solve_entropic(cost: Array, a: Array, b: Array, strength: float) -> Solution:
     """Solve by Newton's method, with an entropy whose weight is halved down to `strength`.
 
     Sinkhorn's iteration is slow on the plateaus of a dual with little entropy. Masses of zero are
-    left out. Returns the plan (N, M) and the columns' potentials (M,).
+    left out.
     """
     rows = np.flatnonzero(a)
     columns = np.flatnonzero(b)
@@ -401,25 +411,25 @@ def _solve_entropic(
         # which few digits are enough.
         weight = strength * 2.0**k
         tolerance = 1e-3 if k else 1e-10
-        matrix, g, error = _solve_unit_entropy(
+        solution = _solve_unit_entropy(
             supported / weight, a[rows], b[columns], g / weight, tolerance
         )
-        g = weight * g
+        g = weight * solution.column_potential
     # Written so that NaN is an error too.
-    if not error < 1e-8:
+    if not solution.error < 1e-8:
         raise SolverError(
-            f"entropic: marginals off by {error:.3g} after {_NEWTON} Newton steps: "
+            f"entropic: marginals off by {solution.error:.3g} after {_NEWTON} Newton steps: "
             f"regularisation {strength:g} needs to be larger, or another solver"
         )
     # Rows and columns without mass are empty.
-    full_matrix = np.zeros(cost.shape)
-    full_matrix[np.ix_(rows, columns)] = matrix
+    plan = np.zeros(cost.shape)
+    plan[np.ix_(rows, columns)] = solution.plan
     potential = np.zeros(cost.shape[1])
     potential[columns] = g
     # A corrected plan must not use forbidden links, whose costs are beyond the range.
     if cost.max() > 1:
-        return _correct_in_proportion(full_matrix, a, b), potential
-    return _correct_marginals(full_matrix, a, b), potential
+        return Solution(_correct_in_proportion(plan, a, b), potential)
+    return Solution(_correct_marginals(plan, a, b), potential)
 
 
 def _correct_in_proportion(matrix: Array, a: Array, b: Array) -> Array:
@@ -433,6 +443,7 @@ def _correct_in_proportion(matrix: Array, a: Array, b: Array) -> Array:
         column_sums = matrix.sum(axis=0)
         # diag(T1) u + T v = a - T1 and Tᵀu + diag(Tᵀ1) v = b - Tᵀ1. Adding a constant to u and
         # taking it off v changes nothing: the system is singular, and the least solution is taken.
+        # Singular values below 1e-13 of the largest are rounding.
         system = np.block(
             [[np.diag(row_sums), matrix], [matrix.T, np.diag(column_sums)]]
         )
@@ -443,9 +454,22 @@ def _correct_in_proportion(matrix: Array, a: Array, b: Array) -> Array:
     return matrix
 
 
-def _plan_of_potential(
-    g: Array, cost: Array, rows: Array, columns: Array
-) -> tuple[Array, float]:
+class _DualPoint(NamedTuple):
+    """The plan (N, M) that belongs to a column potential, and the negative dual value there."""
+
+    plan: Array
+    negative_dual: float
+
+
+class _EntropicSolution(NamedTuple):
+    """A plan (N, M), its column potential (M,), and the total error of its column sums."""
+
+    plan: Array
+    column_potential: Array
+    error: float
+
+
+def _evaluate_dual(g: Array, cost: Array, rows: Array, columns: Array) -> _DualPoint:
     """Return the plan of a column potential, with exact row sums, and the negative dual value.
 
     The potential g is (M,), the cost (N, M), with an entropy of unit weight; `rows` are the masses
@@ -456,25 +480,25 @@ def _plan_of_potential(
     # t_ij = a_i exp(g_j - c_ij) / sum_j exp(g_j - c_ij).
     exponents = g - cost
     log_sums = logsumexp(exponents, axis=1)
-    matrix = rows[:, None] * np.exp(exponents - log_sums[:, None])
+    plan = rows[:, None] * np.exp(exponents - log_sums[:, None])
     # sum_i a_i log sum_j exp(g_j - c_ij) - sum_j b_j g_j.
-    return matrix, float(rows @ log_sums - columns @ g)
+    return _DualPoint(plan, float(rows @ log_sums - columns @ g))
 
 
 def _solve_unit_entropy(
     cost: Array, rows: Array, columns: Array, g: Array, tolerance: float
-) -> tuple[Array, Array, float]:
+) -> _EntropicSolution:
     """Minimise the negative dual with unit entropy by damped Newton steps from g.
 
-    Arguments are as of :func:`_plan_of_potential`. Returns the plan (N, M), the column potential
-    (M,), and the error of the column sums, that of all columns together, to which `tolerance`
-    applies. The step is damped as by Levenberg and Marquardt: ten times less after a success, ten
-    times more after a failure.
+    Arguments are as of :func:`_evaluate_dual`; `tolerance` is for the error of the column sums,
+    that of all columns together. The step is damped as by Levenberg and Marquardt: ten times less
+    after a success, ten times more after a failure.
     """
+    # A start of one percent of the masses: far from the solution a full step could diverge.
     damping = 1e-2
-    matrix, value = _plan_of_potential(g, cost, rows, columns)
+    point = _evaluate_dual(g, cost, rows, columns)
     for _ in range(_NEWTON):
-        sums = matrix.sum(axis=0)
+        sums = point.plan.sum(axis=0)
         # The gradient is sums - columns.
         error = float(np.abs(sums - columns).sum())
         # With more damping than 1e9 the steps vanish: nothing is left to gain.
@@ -482,24 +506,24 @@ def _solve_unit_entropy(
             break
         # Hessian diag(Tᵀ1) - Tᵀ diag(a)⁻¹ T, damped in units of the masses.
         curvature = np.diag(sums + damping * columns)
-        hessian = curvature - matrix.T @ (matrix / rows[:, None])
-        trial = g - np.linalg.solve(hessian, sums - columns)
-        trial_matrix, trial_value = _plan_of_potential(trial, cost, rows, columns)
-        accepted = trial_value < value
+        hessian = curvature - point.plan.T @ (point.plan / rows[:, None])
+        trial_g = g - np.linalg.solve(hessian, sums - columns)
+        trial = _evaluate_dual(trial_g, cost, rows, columns)
+        change = trial.negative_dual - point.negative_dual
+        accepted = change < 0
         # Near the solution the dual falls by less than rounding; its gradient still shrinks.
-        if not accepted and abs(trial_value - value) < 1e-9 * abs(value):
-            trial_error = np.abs(trial_matrix.sum(axis=0) - columns).sum()
+        if not accepted and abs(change) < 1e-9 * abs(point.negative_dual):
+            trial_error = np.abs(trial.plan.sum(axis=0) - columns).sum()
             accepted = bool(trial_error < 0.5 * error)
         if accepted:
             # The dual does not change with a constant added to g. Without any damping the Hessian
             # would be singular in that direction.
-            g = trial - trial.mean()
-            matrix = trial_matrix
-            value = trial_value
+            g = trial_g - trial_g.mean()
+            point = trial
             damping = max(damping / 10, 1e-14)
         else:
             damping *= 10
-    return matrix, g, error
+    return _EntropicSolution(point.plan, g, error)
 
 
 def _correct_marginals(matrix: Array, a: Array, b: Array) -> Array:
@@ -551,30 +575,37 @@ def monotone_plan(
     a, b = _normalize_masses(rows, columns, target.size)
     row_order = np.argsort(source, kind="stable")
     column_order = np.argsort(target, kind="stable")
-    row_ranks, column_ranks, mass = _staircase(a[row_order], b[column_order])
+    staircase = _couple_in_order(a[row_order], b[column_order])
     # From ranks back to the given order.
-    i = row_order[row_ranks]
-    j = column_order[column_ranks]
-    matrix = np.zeros((source.size, target.size))
-    np.add.at(matrix, (i, j), mass)
+    i = row_order[staircase.rows]
+    j = column_order[staircase.columns]
+    plan = np.zeros((source.size, target.size))
+    np.add.at(plan, (i, j), staircase.masses)
     # Potentials with f_i + g_j = c_ij on every cell of the staircase. A step to the next column in
     # the same row leaves f_i, so that g changes by the difference of the two costs. A step down
     # leaves g_j. The staircase never moves both ways at once.
     cost = (source[:, None] - target) ** 2
     cell_cost = cost[i, j]
     previous_column_cost = cost[i[1:], j[:-1]]
-    sideways = np.diff(column_ranks) > 0
+    sideways = np.diff(staircase.columns) > 0
     change = np.where(sideways, cell_cost[1:] - previous_column_cost, 0.0)
     g = np.zeros(target.size)
     g[j] = np.concatenate([[0.0], np.cumsum(change)])
-    return _certify(cost, a, b, matrix, g)
+    return _certify(cost, a, b, Solution(plan, g))
 
 
-def _staircase(a: Array, b: Array) -> tuple[Array, Array, Array]:
+class _Staircase(NamedTuple):
+    """Rows, columns and masses of the N + M - 1 cells of a coupling that keeps the order."""
+
+    rows: Indices
+    columns: Indices
+    masses: Array
+
+
+def _couple_in_order(a: Array, b: Array) -> _Staircase:
     """Return the coupling of masses a (N,) and b (M,) that keeps their order.
 
-    It has N + M - 1 cells, which go down and right like a staircase: their rows, their columns and
-    their masses, of which some may be zero.
+    Its cells go down and right like a staircase. Some may have a mass of zero.
     """
     # The unit interval is cut at both cumulative sums; each interval is a cell.
     cuts = np.concatenate([np.cumsum(a)[:-1], np.cumsum(b)[:-1]])
@@ -584,4 +615,4 @@ def _staircase(a: Array, b: Array) -> tuple[Array, Array, Array]:
     is_row_cut = order < a.size - 1
     rows = np.concatenate([[0], np.cumsum(is_row_cut)])
     columns = np.concatenate([[0], np.cumsum(~is_row_cut)])
-    return rows, columns, np.diff(edges)
+    return _Staircase(rows, columns, np.diff(edges))

@@ -193,13 +193,14 @@ def _solve_couplings(
     addition = _tie_breaker(n)
     plans = np.empty_like(costs)
     for index in np.ndindex(weights.shape[:-1]):
-        scaled_cost = scale_cost(costs[index])[0]
+        scaled_cost = scale_cost(costs[index]).scaled
         if _has_far_members(scaled_cost, rounding):
             plans[index] = _couple_far_members(
                 costs[index], weights[index], solve, rounding
             )
             continue
-        plans[index], _ = solve(scaled_cost + addition, weights[index], equal)
+        solution = solve(scaled_cost + addition, weights[index], equal)
+        plans[index] = solution.plan
     return plans
 
 
@@ -210,7 +211,7 @@ def _has_far_members(scaled_cost: Array, rounding: float = _ROUNDING) -> bool:
 
     >>> x = np.array([[0.0], [1.0], [2.0], [3.0], [1e4]])
     >>> for members in (x, x[:4]):
-    ...     _has_far_members(scale_cost(squared_distances(members))[0])
+    ...     _has_far_members(scale_cost(squared_distances(members)).scaled)
     True
     False
     """
@@ -261,21 +262,22 @@ def _solve_in_stages(
     where the plan has mass, and is cut above a limit for the next stage: a million, then a thousand
     times the typical cost, so that the solver resolves ever smaller differences.
     """
-    scaled_cost, minimum, scale = scale_cost(cost)
-    plan, potential = solve(scaled_cost, a, b)
-    g = minimum + scale * potential
+    scaled_cost = scale_cost(cost)
+    solution = solve(scaled_cost.scaled, a, b)
+    plan = solution.plan
+    g = scaled_cost.potential_of_cost(solution.column_potential)
     for limit in (1e6 * typical, 1e3 * typical):
         # Reduced costs c_ij - f_i - g_j >= 0, with f_i = min_j (c_ij - g_j).
         cost = cost - g
         cost = cost - cost.min(axis=1, keepdims=True)
-        scaled_cost, minimum, scale = scale_cost(np.minimum(cost, limit))
-        trial, potential = solve(scaled_cost, a, b)
+        scaled_cost = scale_cost(np.minimum(cost, limit))
+        trial = solve(scaled_cost.scaled, a, b)
         # Costs were cut at the limit. If the plan needs links above it, it is not the optimal one,
         # and that of the last stage stays. (Some 1e-12 of mass may be there by rounding.)
-        if trial[cost > limit].sum() > 1e-12:
+        if trial.plan[cost > limit].sum() > 1e-12:
             break
-        plan = trial
-        g = minimum + scale * potential
+        plan = trial.plan
+        g = scaled_cost.potential_of_cost(trial.column_potential)
     return plan
 
 

@@ -87,7 +87,11 @@ def estimate_without_messages(
     no_edges = np.zeros((0, 2))
     channel = Channel(Graph.from_edges(len(snapshot.positions), no_edges))
     memory = call_user(protocol.initial_state, snapshot)
-    _, estimates, _ = call_user(protocol.update, memory, snapshot, channel, 1.0)
+    # Without messages the length of the step does not matter.
+    dt = 1.0
+    _memory, estimates, _counts = call_user(
+        protocol.update, memory, snapshot, channel, dt
+    )
     return np.asarray(estimates)
 
 

@@ -44,7 +44,8 @@ class Flooding(FrozenModel, ConsensusProtocol):
         self, memory: Memory, snapshot: SwarmSnapshot, channel: Channel, dt: float
     ) -> Update:
         """Send each agent's table to its neighbours, and retain the latest of each entry."""
-        table = _insert_positions(snapshot, memory[0])
+        (table_before,) = memory
+        table = _insert_positions(snapshot, table_before)
         received = channel.broadcast(snapshot.select_payloads(table))
         latest = table.copy()
         agents = np.arange(len(table))
@@ -111,7 +112,7 @@ def _average_kernels(
     # An entry is identified by its agent and its time.
     entries = np.stack([agent, table[owner, agent, -1]], axis=1)
     # Different entries: where each occurs first, and which of them every entry is.
-    _, first, number = np.unique(
+    _distinct, first, number = np.unique(
         entries, axis=0, return_index=True, return_inverse=True
     )
     positions = table[owner[first], agent[first], :-1]

@@ -36,9 +36,9 @@ def bernoulli(z: Annotated[ArrayInput, "..."]) -> Array:
     >>> bernoulli([-1.0, 0.0, 1.0]).round(6)
     array([1.581977, 1.      , 0.581977])
     """
+    # Near zero by its Taylor series, whose next term, -z⁴/720, is below rounding for |z| < 1e-4.
+    # Far from it z is clipped at 700, since exp(710) overflows.
     small = np.abs(z) < 1e-4
-    # Near zero by its Taylor series, whose next term, -z⁴/720, is below rounding. Far from it z is
-    # clipped at 700, since exp(710) overflows.
     series = 1 - z / 2 + z**2 / 12
     nonzero = np.where(small, 1.0, z)
     ratio = nonzero / np.expm1(np.clip(nonzero, -700.0, 700.0))
@@ -161,7 +161,7 @@ class FokkerPlanck(FrozenModel):
         return forwards * lower_diffusion / square, backwards * upper_diffusion / square
 
     def _assemble(
-        self, t: float, scale: float, identity: float
+        self, t: float, *, scale: float, identity: float
     ) -> scipy.sparse.csc_array:
         """Assemble the matrix identity I + scale A(t)."""
         forwards, backwards = self._rates(t)
@@ -180,7 +180,7 @@ class FokkerPlanck(FrozenModel):
     @validated
     def generator(self, t: float) -> scipy.sparse.csc_array:
         """The matrix A(t) of dp/dt = A p, (n, n), sparse."""
-        return self._assemble(t, 1.0, 0.0)
+        return self._assemble(t, scale=1.0, identity=0.0)
 
     @validated
     def step(
@@ -205,8 +205,8 @@ class FokkerPlanck(FrozenModel):
 
         # θ = 1 for backward Euler, θ = ½ for Crank-Nicolson
         implicit = dt if self.scheme == "backward_euler" else 0.5 * dt
-        right = self._assemble(t, dt - implicit, 1.0)
-        matrix = self._assemble(t + dt, -implicit, 1.0)
+        right = self._assemble(t, scale=dt - implicit, identity=1.0)
+        matrix = self._assemble(t + dt, scale=-implicit, identity=1.0)
         # The pattern is symmetric and columns are diagonally dominant: no pivoting is needed.
         factors = splu(
             matrix,
@@ -244,7 +244,7 @@ class FokkerPlanck(FrozenModel):
             columns = np.array(p.reshape(-1, grid.size).T, order="C")
             x = columns.reshape(*grid.shape, -1)
             for k, axis_factors in enumerate(factors):
-                _solve_tridiagonal(np.moveaxis(x, k, 0), *axis_factors)
+                _solve_tridiagonal(np.moveaxis(x, k, 0), axis_factors)
             return np.ascontiguousarray(x.reshape(grid.size, -1).T).reshape(p.shape)
 
         return step
@@ -269,12 +269,21 @@ class FokkerPlanck(FrozenModel):
             Strictly increasing from 0, in s.
         """
         # One step to each time, of any length.
-        return trajectory(self.step, values, times, 0.0)
+        return trajectory(self.step, values, times, t0=0.0)
 
 
-def _factorize_tridiagonal(
-    forwards: Array, backwards: Array
-) -> tuple[Array, Array, Array]:
+class _TridiagonalFactors(NamedTuple):
+    """Factors of matrices with the pivots p_i of Gauss's elimination.
+
+    They are f_i / p_i and b_i / p_i, (n - 1, ..., 1), and 1 / p_i, (n, ..., 1).
+    """
+
+    lower: Array
+    upper: Array
+    reciprocals: Array
+
+
+def _factorize_tridiagonal(forwards: Array, backwards: Array) -> _TridiagonalFactors:
     """Factor the tridiagonal matrices I - Δ A of all lines of cells along the first axis.
 
     Column i of a matrix is (-backwards[i-1], 1 + both rates out of cell i, -forwards[i]).
@@ -283,11 +292,6 @@ def _factorize_tridiagonal(
     ----------
     forwards, backwards : ndarray, (n - 1, ...)
         Rates times the step Δ at the faces between n cells: f_i from cell i to i + 1, and b_i back.
-
-    Returns
-    -------
-    lower, upper, reciprocals : ndarray, (n - 1, ..., 1), the same and (n, ..., 1)
-        f_i / p_i and b_i / p_i with the pivots p_i of Gauss's elimination, and 1 / p_i.
     """
     pivots = np.ones((len(forwards) + 1, *forwards.shape[1:]))
     # The pivot without the rate forwards: d_0 = 1, d_{i+1} = 1 + b_i d_i/(d_i + f_i).
@@ -300,16 +304,14 @@ def _factorize_tridiagonal(
     lower = forwards * reciprocals[:-1]
     upper = backwards * reciprocals[:-1]
     # A last axis broadcasts over the densities.
-    return lower[..., None], upper[..., None], reciprocals[..., None]
+    return _TridiagonalFactors(
+        lower[..., None], upper[..., None], reciprocals[..., None]
+    )
 
 
-def _solve_tridiagonal(
-    x: Array, lower: Array, upper: Array, reciprocals: Array
-) -> None:
-    """Solve for densities x (n, ..., k) in place along the first axis, by substitution.
-
-    The factors are those of `_factorize_tridiagonal`.
-    """
+def _solve_tridiagonal(x: Array, factors: _TridiagonalFactors) -> None:
+    """Solve for densities x (n, ..., k) in place along the first axis, by substitution."""
+    lower, upper, reciprocals = factors
     # Forward: y_{i+1} = x_{i+1} + (f_i / p_i) y_i.
     for i in range(len(lower)):
         x[i + 1] += lower[i] * x[i]

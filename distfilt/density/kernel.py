@@ -316,6 +316,7 @@ def kernel_covariance(
     0.89
     """
     integral = float(density.sum() * grid.volume)
+    # More than rounding of a sum over the cells.
     if abs(integral - 1) > 1e-8:
         raise ValueError(f"density must have the integral 1, got {integral:g}")
     # Column j is the kernel of an agent in cell j, as masses of the cells.
@@ -375,6 +376,7 @@ def bandwidth(
             f"with a spread of {spread:g}"
         )
     if each_axis is None:
+        # One bandwidth for all axes suits a box whose sides are equal up to rounding.
         each_axis = bool(np.ptp(grid.width) > 1e-9 * grid.width.max())
     # No bandwidth may be below half a cell.
     least: float | Array = 0.5 * float(grid.spacing.max())

@@ -262,7 +262,7 @@ def low_rank_predict(
     noise = np.broadcast_to(np.sqrt(dt) * process, (len(base), *process.shape))
     forecast = np.concatenate([factors, noise], axis=-1)
     # Right singular vectors of the forecast's factor, by increasing singular value.
-    _, vectors = np.linalg.eigh(forecast.mT @ forecast)
+    vectors = np.linalg.eigh(forecast.mT @ forecast).eigenvectors
     leading = vectors[..., -factors.shape[-1] :]
     return low_rank_start(forecast @ leading, base)
 

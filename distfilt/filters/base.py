@@ -48,7 +48,7 @@ from ..validation import (
     skip_validation,
     validated,
 )
-from ..validation.clocks import warn_of_clock
+from ..validation.clocks import warn_of_clock, warn_of_unit
 from .bridge import insert_times
 from .failures import RECOVERABLE, FilterError, is_argument_error
 from .observations import Observation, match_delayed, read_observations
@@ -291,6 +291,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
             )
         if runs and min(runs) < 1:
             raise ValueError(f"runs must be sizes of at least 1, got {runs!r}")
+        warn_of_unit(t, "t")
         fields = self.initial_state(prior, runs, rng)
         # The steps have a stream of their own, whatever else the user draws from `rng`.
         child = None
@@ -320,7 +321,8 @@ class Filter(FrozenModel, ABC, Generic[S]):
             The new time, in s; at the state's own time nothing is forecast.
         observations : sequence of length A
             Per agent (*runs, m) or (m,), or None; or one :class:`Observation`, or a list of them.
-            NaN marks a missing component, run by run.
+            Or a list of Observations alone, in any order. NaN marks a missing component, run by
+            run.
         delayed : sequence of Observation
             Observations of earlier times that arrive now; the filter needs a `lag` that reaches
             back to them. A time between two steps is inserted among those that the state keeps,

@@ -128,7 +128,10 @@ def insert_times(
 
 
 def _is_kept(t_obs: float, times: Sequence[float], t: float) -> bool:
-    """Whether a time is one of these to rounding."""
+    """Whether a time is one of these to rounding.
+
+    A sum of steps may differ by rounding, but by far less than the shortest of them.
+    """
     shortest = min((b - a for a, b in pairwise((*times, t)) if b > a), default=0.0)
     tolerance = min(1e-9 * max(1.0, abs(t_obs)), 1e-3 * shortest)
     return min(abs(time - t_obs) for time in times) <= tolerance
@@ -154,18 +157,30 @@ def _forecast(
     return quiet._advance(state, t, [None] * f.n_agents, (), reuse_rng=reuse_rng)
 
 
-def split_history(state: State, t_obs: float) -> tuple[int, float, float]:
-    """Return how many kept times are before `t_obs`, and the times on both of its sides."""
+class Gap(NamedTuple):
+    """The gap between two kept times in which another one lies.
+
+    `place` is the number of kept times before it; `start` and `end` are those on both of its sides.
+    """
+
+    place: int
+    start: float
+    end: float
+
+
+def find_gap(state: State, t_obs: float) -> Gap:
+    """Return the gap between a state's kept times in which `t_obs` lies."""
     times = (*state.times, state.t)
     place = sum(time < t_obs for time in times)
-    return place, times[place - 1], times[place]
+    return Gap(place, start=times[place - 1], end=times[place])
 
 
 def insert_gaussian(
     f: GaussianFilter, state: GaussianState, t_obs: float
 ) -> GaussianState:
     """Return a Gaussian state with the belief about a time between two that it keeps."""
-    place, start, end = split_history(state, t_obs)
+    gap = find_gap(state, t_obs)
+    place = gap.place
     d = state.dim
     n = len(state.history) + 1
     mean = state.joint_means
@@ -175,7 +190,8 @@ def insert_gaussian(
     before = slice((n - place) * d, (n - place + 1) * d)
     std = deviations(cov[..., before, before])
     model = f.model_of_states(state.runs)
-    law = bridge_states(model, mean[..., before], (start, t_obs, end), std)
+    times_of_law = (gap.start, t_obs, gap.end)
+    law = bridge_states(model, mean[..., before], times_of_law, std)
     # Given the state before, x(τ) is `forecast` and the state after is `law.after`, on average.
     innovation = wrap_differences(mean[..., after] - law.after, f.periods)
     new_mean = law.forecast + (law.gain @ innovation[..., None])[..., 0]
@@ -211,18 +227,18 @@ def insert_members(
     from .base import require_rng
     from .step import copy_rng
 
-    place, start, end = split_history(state, t_obs)
-    beliefs = [*[belief for _, belief in state.past], state.belief]
+    gap = find_gap(state, t_obs)
+    beliefs = [*[belief for _time, belief in state.past], state.belief]
     # Steps of members draw, so that their states have a generator.
     rng = copy_rng(require_rng(state.rng))
     drawn = draw_bridge(
         f.model_of_states(state.runs),
-        beliefs[place - 1],
-        beliefs[place],
-        (start, t_obs, end),
+        beliefs[gap.place - 1],
+        beliefs[gap.place],
+        (gap.start, t_obs, gap.end),
         f.draw_normal(state.belief.shape, rng),
         f.periods,
     )
     history = list(state.past)
-    history.insert(place, (t_obs, drawn))
+    history.insert(gap.place, (t_obs, drawn))
     return state.replace(history=tuple(history[-f.lag :]), rng=rng)

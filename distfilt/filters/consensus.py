@@ -122,19 +122,19 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
         # All agents' angles on one branch, so that vectors can be averaged.
         branch = fold(means, self.periods)
         gained = np.zeros((*branch.shape, branch.shape[-1] + 1))
-        for _, group in step.received():
+        for _place, group in step.received():
             self._add_information(gained, means, branch, covs, group, step)
         # δΩ and δq of each agent's own observations
         own = pack_information(gained[..., :-1], gained[..., -1])
         if not step.has_fusion:
-            new = self._add(step, branch, covs, own)
+            new = self._add_to_forecast(step, branch, covs, own)
         elif self.average == "measurements":
             # Ω + ω ⟨δΩ⟩
             (averaged,) = step.fuse(own)
-            new = self._add(step, branch, covs, self._omega * averaged)
+            new = self._add_to_forecast(step, branch, covs, self._omega * averaged)
         else:
-            total = self._total(step, branch, covs, own)
-            new = self._solve(step, branch, covs, total)
+            total = self._average_information(step, branch, covs, own)
+            new = self._find_gaussians(step, branch, covs, total)
         means, covs = new
         return self._end(step, means, symmetrise(covs))
 
@@ -143,7 +143,7 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
         """The weight ω of averaged information; the average times A is the sum."""
         return float(self.n_agents) if self.weight is None else self.weight
 
-    def _total(
+    def _average_information(
         self, step: Step[GaussianState], means: Array, covs: Array, own: Array
     ) -> Array:
         """Return the packed information of forecasts and observations after the consensus."""
@@ -162,7 +162,7 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
         # ⟨Ω⟩ + ω ⟨δΩ⟩
         return np.asarray(averaged[..., :half] + self._omega * averaged[..., half:])
 
-    def _solve(
+    def _find_gaussians(
         self, step: Step[GaussianState], means: Array, covs: Array, total: Array
     ) -> tuple[Array, ...]:
         """Return the Gaussians that have this information."""
@@ -173,7 +173,7 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
 
         return step.apply(compute, (total,), (means, covs), range(self.n_agents))
 
-    def _add(
+    def _add_to_forecast(
         self, step: Step[GaussianState], means: Array, covs: Array, gained: Array
     ) -> tuple[Array, ...]:
         """Return the Gaussians with information added; components may be known constants."""
@@ -205,12 +205,14 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
         rows = group.rows
         mean = means[..., rows, :]
         cov = covs[..., rows, :, :]
-        group, innovation, slope, extra = self._innovate(mean, cov, group, step)
-        missing = np.isnan(innovation)
+        result = self._innovate(mean, cov, group, step)
+        missing = np.isnan(result.innovation)
         # A missing component has a row of zeros, and a unit variance of its own.
-        slope = np.where(missing[..., None], 0.0, slope)
-        innovation = np.where(missing, 0.0, innovation)
-        noise = group.noise if extra is None else group.noise + extra
+        slope = np.where(missing[..., None], 0.0, result.slope)
+        innovation = np.where(missing, 0.0, result.innovation)
+        noise = result.group.noise
+        if result.extra_cov is not None:
+            noise = noise + result.extra_cov
         is_pair = ~missing[..., :, None] & ~missing[..., None, :]
         noise = np.where(is_pair, noise, np.eye(noise.shape[-1]))
         # z = y - h(m) + H m is linear in the state.

@@ -227,7 +227,7 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
         self, prior: Prior, runs: tuple[int, ...], rng: Rng | None
     ) -> dict[str, object]:
         """Return the estimates at the agents' first positions (A, d), NaN for absent agents."""
-        snapshot = self._snapshot(prior, "prior", 0.0)
+        snapshot = self._snapshot(prior, "prior", t=0.0)
         # Only these agents have a filter. At the start all are taken to be connected.
         agents = self.filtering
         filters = low_rank_start(self._prior_factor, self._prior_mean(snapshot)[agents])

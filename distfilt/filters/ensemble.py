@@ -27,10 +27,11 @@ from ..updates import enkf, enkf_exact, stochastic_forecast, with_missing
 from ..updates.decorator import has_tag
 from ..updates.gaussian import exact_forecast
 from ..updates.particles import (
+    ParticleCollapse,
+    describe_collapse,
+    effective_size_of,
     log_likelihood,
     log_normalizer,
-    size_of,
-    warn_of_collapse,
     warn_of_weights,
 )
 from ..updates.wrappers import find_locate
@@ -117,7 +118,7 @@ class MembersFilter(
     def check_state(self, state: MemberState) -> None:
         """Refuse a state that is not of this filter."""
         super().check_state(state)
-        name, _ = state.belief_field
+        name, _axes = state.belief_field
         sizes = getattr(state, name).shape[-2:]
         if sizes != (self.members, self.model.dim):
             raise ValueError(
@@ -376,9 +377,12 @@ class EnsembleFilter(
             # All times' members meet the same draws, so that the separate updates are one joint
             # update; the last of them advances the generator.
             updated = [
-                self._update(x, h, y, noise, copy_rng(rng), None, places) for x in past
+                self._update(x, h, y, noise, copy_rng(rng), predict=None, places=places)
+                for x in past
             ]
-            new = self._update(present, h, y, noise, rng, predict_again, places)
+            new = self._update(
+                present, h, y, noise, rng, predict=predict_again, places=places
+            )
             return (*updated, new)
 
         results = step.apply(
@@ -427,8 +431,9 @@ class EnsembleFilter(
         y: Array,
         noise: Array,
         rng: Rng,
+        *,
         predict: Callable[[Array], Array] | None,
-        places: Array | None = None,
+        places: Array | None,
     ) -> Array:
         """Update ensembles (..., G, N, d); a plain function gets one agent's at a time."""
         if self._repredicts:
@@ -567,7 +572,7 @@ class TransportFilter(_EnsembleSummary):
             total = log_sum_exp(logs)[..., 0] - np.log(self.members)
             step.add_log_likelihood(total, slice(None))
         stack = self._transport(stack, logs, step)
-        self._warn(logs, step)
+        self._warn_of_collapse(logs, step)
         if self.periods:
             stack = [settle(members, self.periods) for members in stack]
         return step.end(ensembles=stack[-1], past=stack[:-1])
@@ -583,7 +588,7 @@ class TransportFilter(_EnsembleSummary):
 
     def draw_normal(self, shape: tuple[int, ...], rng: Rng) -> Array:
         """Draw standard normal numbers, the same for all agents."""
-        *runs, _, n, d = shape
+        *runs, _n_agents, n, d = shape
         return rng.standard_normal((*runs, 1, n, d))
 
     def _draw_in_common(
@@ -668,29 +673,18 @@ class TransportFilter(_EnsembleSummary):
             for new, old in zip(moved, stack, strict=True)
         ]
 
-    def _warn(self, logs: Array, step: Step[EnsembleState]) -> None:
-        """Warn if one member has nearly all the weight: its copies are left to go on from.
-
-        >>> import warnings
-        >>> from types import SimpleNamespace
-        >>> step = SimpleNamespace(t=1.0, failed=np.array([False, False, True]))
-        >>> logs = np.array(
-        ...     [[[0.0, 0.0]], [[0.0, 0.0]], [[0.0, -99.0]]]
-        ... )  # runs, agents, members
-        >>> TransportFilter._warn(None, logs, step)
-        >>> with warnings.catch_warnings(action="error"):
-        ...     TransportFilter._warn(None, logs[::-1], step)
-        Traceback (most recent call last):
-        distfilt.updates.particles.ParticleCollapse: t = 1 s: an agent's weights have an ...
-        """
+    def _warn_of_collapse(self, logs: Array, step: Step[EnsembleState]) -> None:
+        """Warn once if one member has nearly all the weight: its copies are left to go on from."""
         weights = normalize_weights(logs[~step.failed])
-        size = size_of(weights).min(initial=np.inf)
+        size = effective_size_of(weights).min(initial=np.inf)
+        # An effective size of 1.1 means that one member has 95 % of the weight.
         if size < 1.1:
-            warn_of_collapse(
-                f"t = {format_number(step.t)} s: an agent's weights have an effective size of "
-                f"{size:.1f}",
-                "rejuvenation=",
+            time = format_number(step.t)
+            problem = (
+                f"t = {time} s: an agent's weights have an effective size of {size:.1f}"
             )
+            text = describe_collapse(problem, "rejuvenation=")
+            step.warn_once("collapse of weights", text, ParticleCollapse)
 
 
 def fuse_members(step: Step[AnyState], members: Array) -> Array:
@@ -717,12 +711,11 @@ def regress_past(stack: list[Array], fused: Array) -> list[Array]:
     if fused is present or not past:
         return past
     # In units of the standard deviations, so that the cut of small eigenvalues has no units.
-    correlation, unit = to_unit_variances(moments.sample_covariance(present))
+    correlation, std = to_unit_variances(moments.sample_covariance(present))
     n = present.shape[-2]
     inverse = np.linalg.pinv(correlation, rcond=1e-10, hermitian=True) / (n - 1)
-    _, anomalies = center_ensemble(present)
-    scaled = anomalies / unit[..., None, :]
-    shift = (fused - present) / unit[..., None, :]
+    scaled = center_ensemble(present).anomalies / std[..., None, :]
+    shift = (fused - present) / std[..., None, :]
     # x_past + Δ C⁻¹ Aᵀ x_past / (N - 1)
     return [x + shift @ (inverse @ (scaled.mT @ x)) for x in past]
 

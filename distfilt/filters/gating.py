@@ -148,7 +148,7 @@ class RejectionStreaks:
         has_reached = self.count(np.array(numbers), present & ~kept, kept)
         if not has_reached.any():
             return None
-        *_, first = np.argwhere(has_reached)[0].tolist()
+        *_run, first = np.argwhere(has_reached)[0].tolist()
         kind = before.kind_of(int(rows[first]), int(has[first].argmax()))
         return self.describe(numbers[first], kind)
 

@@ -7,20 +7,20 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property, partial
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 
 from ..derivatives import needs_differences
-from ..gaussians.single import condition, condition_complete, unscented_points
+from ..gaussians.single import condition, unscented_points
 from ..linalg import (
     EPS,
     cholesky,
     deviations,
     factor,
     identity,
+    solve_lower,
     solve_semidefinite,
-    solve_upper,
     symmetrise,
 )
 from ..models import LinearModel
@@ -124,6 +124,31 @@ class GaussianState(SensorState):
         return self.joint_covariances[..., : self.dim, : self.dim]
 
 
+class _Linearization(NamedTuple):
+    """A function of a Gaussian as value + slope (x - mean), with an error of that covariance.
+
+    The extra covariance is that of the values of unscented points beyond the linear part, or None.
+    """
+
+    value: Array
+    slope: Array
+    extra_cov: Array | None
+
+
+class _Innovation(NamedTuple):
+    """A group's observations beside their predictions.
+
+    The group lacks the observations that the gate rejects. The innovation y - h(m) is NaN where a
+    number is missing or the sensor cannot see it. Slope and extra covariance are those of the
+    predictions, as in :class:`_Linearization`.
+    """
+
+    group: Received
+    innovation: Array
+    slope: Array
+    extra_cov: Array | None
+
+
 @dataclass(frozen=True, eq=False)
 class GaussianFamily(
     SensorFilter[GaussianState],
@@ -162,7 +187,7 @@ class GaussianFamily(
     ) -> dict[str, object]:
         """Return the prior's mean and covariance, the same for all runs."""
         d = self.model.dim
-        mean, cov = moments_by_agent(prior, d, self.n_agents)
+        mean, cov = moments_by_agent(prior, d, self.n_agents, periods=self.periods)
         lead = (*runs, self.n_agents)
         mean = wrap_differences(mean, self.periods)
         # Without a past the joint state is the present one.
@@ -193,7 +218,7 @@ class GaussianFamily(
             means, covs = self._condition(means, covs, place, group, step)
             is_symmetric = is_symmetric or len(group.agents) == self.n_agents
         # A run that failed here needs a covariance with a Cholesky factor in the fusion.
-        covs = step.keep_failed(covs, identity(means.shape[-1]))
+        covs = step.keep_failed(covs, old=identity(means.shape[-1]))
         if step.has_fusion:
             means, covs = self._fuse(means, covs, step)
             is_symmetric = False
@@ -206,8 +231,9 @@ class GaussianFamily(
         means, covs = self._forecast(step)
         if all_finite(means) and all_finite(covs) and not step.any_failed:
             return means, covs
-        means = step.check_forecast(means, 0.0)
-        return means, step.check_forecast(covs, identity(means.shape[-1]))
+        unit = identity(means.shape[-1])
+        means = step.check_forecast(means, old=0.0)
+        return means, step.check_forecast(covs, old=unit)
 
     def _end(
         self, step: Step[GaussianState], means: Array, covs: Array, **fields: Array
@@ -248,22 +274,23 @@ class GaussianFamily(
             move = partial(self._step_points, step)
         else:
             move = partial(model.step, t=state.t, dt=dt)
-        mean, slope, extra = self._linearize(
+        moved = self._linearize(
             move,
             partial(self._differentiate_step, step),
             state.means,
             state.covariances,
-            isinstance(model, LinearModel),
+            is_linear=isinstance(model, LinearModel),
         )
+        mean = moved.value
         # P = F P Fᵀ + Q, with a contiguous F.
-        slope = np.ascontiguousarray(slope)
+        slope = np.ascontiguousarray(moved.slope)
         old = state.joint_covariances
         if model.has_state_noise:
             noise = model.noise_at(state.means, state.t, dt)
         else:
             noise = model.Q(state.t, dt)
-        if extra is not None:
-            noise = noise + extra
+        if moved.extra_cov is not None:
+            noise = noise + moved.extra_cov
         cov = slope @ state.covariances @ slope.mT + noise
         size = len(step.times) * d
         if size:
@@ -308,9 +335,10 @@ class GaussianFamily(
         jacobian: Callable[[Array, Array], Array],
         mean: Array,
         cov: Array,
+        *,
         is_linear: bool,
-    ) -> tuple[Array, Array, Array | None]:
-        """Return value, slope and extra covariance, if any, of a function of a Gaussian.
+    ) -> _Linearization:
+        """Replace a function of a Gaussian by a linear one.
 
         ``jacobian(mean, cov)`` is the derivative at the mean (..., d); finite differences take
         their step from the covariance.
@@ -318,7 +346,7 @@ class GaussianFamily(
         if is_linear or self.linearization == "extended":
             # For a linear function unscented points would give the same.
             value = function(mean[..., None, :])[..., 0, :]
-            return value, jacobian(mean, cov), None
+            return _Linearization(value, jacobian(mean, cov), extra_cov=None)
         # P = L Lᵀ; the divisor is L, with ones on the diagonal in columns of zeros. These belong to
         # components without variance: their points do not differ, and their slope becomes zero.
         root, divisor = _factor_covariance(cov)
@@ -332,7 +360,7 @@ class GaussianFamily(
         ahead = values[..., 1 : d + 1, :]
         behind = values[..., d + 1 :, :]
         scaled_slope = (ahead - behind) / (2 * np.sqrt(d + self.kappa))
-        slope = solve_upper(divisor, scaled_slope).mT
+        slope = solve_lower(divisor, scaled_slope, transposed=True).mT
         # The covariance of the values beyond the linear part H P Hᵀ.
         total = (weights[:, None] * anomalies).mT @ anomalies
         extra = total - scaled_slope.mT @ scaled_slope
@@ -340,7 +368,7 @@ class GaussianFamily(
             # Components of the value that some point cannot see are NaN, and so is their slope: an
             # update leaves them out. NaN would spoil the covariance of the others.
             extra = np.where(np.isnan(extra), 0.0, extra)
-        return value, slope, extra
+        return _Linearization(value, slope, extra)
 
     def _condition(
         self,
@@ -367,7 +395,10 @@ class GaussianFamily(
             block = slice(first, first + d)
             mean = joint_mean[..., block]
             cov = joint_cov[..., block, block]
-        group, innovation, slope, extra = self._innovate(mean, cov, group, step)
+        result = self._innovate(mean, cov, group, step)
+        group = result.group
+        innovation = result.innovation
+        slope = result.slope
         if self.iterations > 1 and not group.linear:
             innovation, slope = self._relinearize(
                 mean, cov, innovation, slope, group, step
@@ -378,12 +409,11 @@ class GaussianFamily(
             joint_slope[..., block] = slope
             slope = joint_slope
         arrays: tuple[Array, ...] = (joint_mean, joint_cov, innovation, slope)
-        if extra is not None:
+        if result.extra_cov is not None:
             # S = H P Hᵀ + R, where the extra covariance of the unscented points counts as noise.
-            arrays = (*arrays, group.noise + extra)
-        is_complete = all_finite(innovation)
+            arrays = (*arrays, group.noise + result.extra_cov)
         new_mean, new_cov = step.apply(
-            _condition_complete_rows if is_complete else _condition_rows,
+            _condition_rows,
             arrays,
             (joint_mean, joint_cov),
             group.agents,
@@ -412,7 +442,7 @@ class GaussianFamily(
         Each is a step of Gauss and Newton to the maximum of the posterior density.
         """
         for _ in range(self.iterations - 1):
-            x, _ = step.apply(
+            x, _cov = step.apply(
                 _condition_rows,
                 (mean, cov, innovation, slope),
                 (mean, cov),
@@ -435,19 +465,14 @@ class GaussianFamily(
 
     def _innovate(
         self, mean: Array, cov: Array, group: Received, step: Step[GaussianState]
-    ) -> tuple[Received, Array, Array, Array | None]:
-        """Compare a group's observations with predictions by Gaussians (*runs, G, d).
-
-        Returns the group without the observations that the gate rejects, and the innovations
-        r = y - h(m), NaN where a number is missing or the sensor cannot see it. Behind them come
-        the slope of the predictions, and their extra covariance, if any.
-        """
+    ) -> _Innovation:
+        """Compare a group's observations with predictions by Gaussians (*runs, G, d)."""
         predicted, slope, extra = self._linearize(
             partial(group.predict, branch="first"),
             group.jacobian,
             mean,
             cov,
-            group.linear,
+            is_linear=group.linear,
         )
         innovation = group.target - predicted
         is_complete = all_finite(innovation)
@@ -461,7 +486,7 @@ class GaussianFamily(
 
         if step.tests_innovations:
 
-            def moments(_: Array) -> tuple[Array, Array]:
+            def moments(_points: Array) -> tuple[Array, Array]:
                 """Return the moments of the prediction, which lie on one branch."""
                 predicted_cov = slope @ cov @ slope.mT
                 if extra is not None:
@@ -470,7 +495,7 @@ class GaussianFamily(
 
             group = step.gate(group, moments, predicted[..., None, :])
             innovation = group.target - predicted
-        return group, innovation, slope, extra
+        return _Innovation(group, innovation, slope, extra)
 
     def _leave_out_unseen(
         self,
@@ -616,7 +641,7 @@ def _check_fused(mean: Array, variance: Array, t: float) -> None:
             f"covariance after fusion is below rounding at t = {format_number(t)} s: "
             "information is probably counted twice",
             RuntimeWarning,
-            5,
+            stacklevel=5,
         )
 
 
@@ -653,23 +678,17 @@ def _fill_zero_columns(root: Array) -> Array:
     return np.asarray(root + np.where(is_zero[..., None], np.eye(root.shape[-1]), 0.0))
 
 
-def _condition_complete_rows(
-    mean: Array,
-    cov: Array,
-    innovation: Array,
-    slope: Array,
-    noise: Array,
-    *_: object,
-) -> tuple[Array, Array]:
-    return condition_complete(mean, cov, innovation, slope, noise)
-
-
 def _condition_rows(
     mean: Array,
     cov: Array,
     innovation: Array,
     slope: Array,
     noise: Array,
-    *_: object,
+    *_others: object,
 ) -> tuple[Array, Array]:
+    """Condition Gaussians, with the arguments that :meth:`Step.apply` passes.
+
+    It passes its arrays, then the noise that all rows share, then a generator. So `noise` is the
+    last of the arrays where they end with one for each row, and otherwise the shared one.
+    """
     return condition(mean, cov, innovation, slope, noise)

@@ -11,7 +11,7 @@ import numpy as np
 from ..density import Grid
 from ..linalg import cholesky, log_sum_exp, solve_lower
 from ..updates import particles
-from ..validation import Array, Rng, all_finite
+from ..validation import Array, Indices, Rng, all_finite
 from .base import SensorFilter
 from .options import FusesBeliefs, IsolatesRuns, ScoresObservations, SharesObservations
 from .particle import compute_moments, select_visible
@@ -31,6 +31,8 @@ _REACH = 6.0
 """Standard deviations of the process noise after which it is cut off."""
 _FINEST = 0.5
 """The smallest standard deviation of the process noise, in widths of a cell."""
+_MOST = 0.5
+"""The largest probability that the outermost cells may have without a warning."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -175,9 +177,9 @@ class GridFilter(
 
     def next_state(self, step: Step[GridState]) -> GridState:
         """Forecast the cells' probabilities, weight them by likelihoods, fuse."""
-        forecast = step.keep_failed(self._forecast(step), 0.0)
+        forecast = step.keep_failed(self._forecast(step), old=0.0)
         logs = _normalize(forecast)
-        for _, group in step.received():
+        for _place, group in step.received():
             self._weight(logs, group, step)
         if step.has_fusion and self.fused == "likelihoods":
             # log p(y | x) + a constant: the change by the own observations
@@ -218,7 +220,7 @@ class GridFilter(
         columns = step.state.masses.reshape(-1, old.shape[-1]).T
         forecast = (matrix @ columns).T.reshape(old.shape)
         # Columns of the matrix sum to less than 1 near the sides of the box.
-        total = step.keep_failed(forecast.sum(axis=-1), 1.0)
+        total = step.keep_failed(forecast.sum(axis=-1), old=1.0)
         if (total < 0.99).any():
             step.warn_once(
                 "outside",
@@ -265,9 +267,29 @@ class GridFilter(
         logs[..., rows, :], total = step.apply(
             _normalize_joint, (joint,), (old, zero), group.agents
         )
+        self._warn_of_edge(logs[..., rows, :], step)
         if step.scores:
             constant = particles.log_normalizer(group.target, group.noise)
             step.add_log_likelihood(total + constant, group.agents)
+
+    def _warn_of_edge(self, logs: Array, step: Step[GridState]) -> None:
+        """Warn once if most of a belief lies in the outermost cells, beside which it continues."""
+        at_edge = np.exp(logs[..., self._outermost]).sum(axis=-1)
+        largest = step.keep_failed(at_edge, old=0.0).max(initial=0.0)
+        if largest > _MOST:
+            step.warn_once(
+                "edge",
+                f"grid must have a box in which the state stays, but at t = {step.t:g} s a "
+                f"probability of {largest:.2g} is in the outermost cells",
+            )
+
+    @cached_property
+    def _outermost(self) -> Indices:
+        """The cells at a side of the box, along axes with ten cells or more."""
+        shape = np.array(self.grid.shape)
+        places = np.indices(self.grid.shape).reshape(shape.size, -1).T
+        at_side = ((places == 0) | (places == shape - 1)) & (shape >= 10)
+        return np.flatnonzero(at_side.any(axis=-1))
 
 
 def _normalize(logs: Array) -> Array:
@@ -275,9 +297,13 @@ def _normalize(logs: Array) -> Array:
     return np.maximum(logs - log_sum_exp(logs), _LEAST)
 
 
-def _normalize_joint(joint: Array, *_: object) -> tuple[Array, Array]:
-    """Return normalised logarithms, and those of the sums."""
+def _normalize_joint(joint: Array, *_others: object) -> tuple[Array, Array]:
+    """Return normalised logarithms, and those of the sums.
+
+    The shared array and the generator that :meth:`Step.apply` adds are not needed.
+    """
     total = log_sum_exp(joint)
+    # Minus infinity, or NaN.
     if not (total > -1e300).all():
         raise ArithmeticError("every cell has a likelihood of zero")
     return np.maximum(joint - total, _LEAST), total[..., 0]
@@ -285,7 +311,8 @@ def _normalize_joint(joint: Array, *_: object) -> tuple[Array, Array]:
 
 def _predict_moments(predicted: Array, weights: Array) -> tuple[Array, Array]:
     """Return moments of the predictions of the cells that can see; NaN if none can."""
-    return compute_moments(*select_visible(predicted, weights))
+    visible, visible_weights = select_visible(predicted, weights)
+    return compute_moments(visible, visible_weights)
 
 
 @lru_cache(maxsize=8)

@@ -61,7 +61,7 @@ def information_increment(before: GaussianMixture, after: GaussianMixture) -> Ar
     posterior_root = posterior.factors[0]
     # In the frame in which the prior covariance L Lᵀ is the identity, the information is
     # (L₊⁻¹ L)ᵀ (L₊⁻¹ L) = V diag(s²) Vᵀ.
-    _, s, axes = np.linalg.svd(np.linalg.solve(posterior_root, prior_root))
+    _u, s, axes = np.linalg.svd(np.linalg.solve(posterior_root, prior_root))
     gain = s**2 - 1
     is_gained = gain > _MIN_GAIN
     root_gain = np.sqrt(gain[is_gained])
@@ -178,8 +178,9 @@ class InformationIncrementFilter(TargetMixtureFilter):
         after = []
         for agent, belief in enumerate(beliefs):
             # The agent's own components; the shared ones follow after the exchange.
-            private, _ = split[agent]
-            after.append(self._condition(belief, agent, private, step)[0])
+            private, _shared = split[agent]
+            updated, _second = self._condition(belief, agent, private, step)
+            after.append(updated)
         # Each agent's belief without the information it has not sent: from before the present
         # observations, or from before those that wait.
         unsent: list[GaussianMixture | None] = []
@@ -193,7 +194,7 @@ class InformationIncrementFilter(TargetMixtureFilter):
         if step.channel is not None:
             outgoing = self._choose_increments(after, unsent, step)
             self._exchange(outgoing, after, unsent, step)
-        for agent, (_, shared) in enumerate(split):
+        for agent, (_private, shared) in enumerate(split):
             after[agent], unsent[agent] = self._condition(
                 after[agent], agent, shared, step, unsent[agent]
             )
@@ -225,7 +226,8 @@ class InformationIncrementFilter(TargetMixtureFilter):
             # An increment below the threshold is sent with the next one.
             if increment.size:
                 # Without the zeros below the diagonal: 13 numbers for two rows of six.
-                upper = np.triu_indices(len(increment), 0, increment.shape[1])
+                n_rows, n_columns = increment.shape
+                upper = np.triu_indices(n_rows, m=n_columns)
                 outgoing[agent] = increment[upper]
                 unsent[agent] = None
         return outgoing
@@ -304,7 +306,7 @@ def _unpack(numbers: Array, n: int) -> Array:
     sizes = [r * (n + 1) - r * (r - 1) // 2 for r in range(1, n + 1)]
     n_rows = sizes.index(numbers.size) + 1
     increment = np.zeros((n_rows, n + 1))
-    increment[np.triu_indices(n_rows, 0, n + 1)] = numbers
+    increment[np.triu_indices(n_rows, m=n + 1)] = numbers
     return increment
 
 

@@ -187,13 +187,15 @@ class LikelihoodConsensusFilter(ParticleFamily):
             rows = group.rows
             # log p(y | x) of each agent's own observations, but for a constant
             logs = own[..., rows, :] - log_weights[..., rows, :]
+            # An impossible observation leaves a weight of zero.
+            is_possible = own[..., rows, :] > -1e299
             whitened = _whiten(group, stack[-1][..., rows, :, :])
             coefficients[..., rows, :] = _approximate(
                 regression.select(rows),
                 products,
                 logs,
                 whitened,
-                own[..., rows, :] > -1e299,
+                is_possible,
             )
         (averaged,) = step.fuse(coefficients)
         # A times the average is the sum over the agents.
@@ -285,12 +287,12 @@ class _Products:
             constant = np.zeros((1, len(basis.components)), dtype=int)
             exponents = np.concatenate([constant, basis.exponents])
             sums = exponents[self.first] + exponents[self.second]
-            _, labels = np.unique(sums, axis=0, return_inverse=True)
+            _distinct, labels = np.unique(sums, axis=0, return_inverse=True)
         labels = labels.ravel()
         self.labels: Indices = labels
         self.size = int(labels.max()) + 1
         # One pair of each product
-        _, self.pairs = np.unique(labels, return_index=True)
+        _distinct, self.pairs = np.unique(labels, return_index=True)
 
     def evaluate(self, functions: Array) -> Array:
         """Return the products of functions (..., N, P), (..., N, K)."""
@@ -325,7 +327,7 @@ def _whiten(group: Received, members: Array) -> Array:
 
     Missing numbers have none; what a particle cannot predict is NaN.
     """
-    predicted = group.predict(members, None, branch="each")
+    predicted = group.predict(members, branch="each")
     # L⁻¹ (y - h(x)) with R = L Lᵀ; a missing number has a unit variance of its own. So has that
     # of a sensor that is a likelihood, which has no variance.
     variance = np.diagonal(group.noise, axis1=-2, axis2=-1)
@@ -344,7 +346,11 @@ def _approximate(
     whitened: Array,
     is_possible: Mask,
 ) -> Array:
-    """Return the coefficients of some agents' log-likelihoods in the products, (*runs, G, K)."""
+    """Return the coefficients of some agents' log-likelihoods in the products, (*runs, G, K).
+
+    A Gaussian log-likelihood is -½ |r|² of the whitened residuals r: these are fitted by the basis
+    functions, so that the squares are exact if the sensor is. Others are fitted directly.
+    """
     alive = regression.is_alive
     # Whether the log-likelihoods are -½ |r|², but for a constant
     exact = -0.5 * (whitened**2).sum(axis=-1)
@@ -352,6 +358,7 @@ def _approximate(
     largest = np.where(alive, np.abs(exact), 0.0).max(axis=-1)
     span = difference.max(axis=-1, where=alive, initial=-np.inf)
     span = span - difference.min(axis=-1, where=alive, initial=np.inf)
+    # They are if the difference is the same for all particles, up to rounding.
     is_gaussian = span <= 1e-9 * (1 + largest)
     is_gaussian &= (is_possible | ~alive).all(axis=-1)
     squares = products.expand_squares(regression.fit(np.nan_to_num(whitened)))

@@ -109,7 +109,9 @@ class TargetMixtureFilter(
         self, prior: Prior, runs: tuple[int, ...], rng: Rng | None
     ) -> dict[str, object]:
         """Return a mixture for each agent."""
-        mixtures = prior_mixtures(prior, self.model.dim, self.n_agents)
+        mixtures = prior_mixtures(
+            prior, self.model.dim, self.n_agents, periods=self.periods
+        )
         settled = [settle_mixture(mixture, self.periods) for mixture in mixtures]
         return {"mixtures": tuple(settled)}
 
@@ -141,9 +143,8 @@ class TargetMixtureFilter(
 
     def summarize(self, state: MixtureState) -> Summary:
         """Return moments of the whole mixtures, and their numbers of components."""
-        moments = [belief.moments() for belief in state.mixtures]
-        mean = np.array([m for m, _ in moments])
-        cov = np.array([p for _, p in moments])
+        mean = np.array([belief.mean for belief in state.mixtures])
+        cov = np.array([belief.cov for belief in state.mixtures])
         # Recorded as an array (A,) like the other numbers.
         sizes = [float(belief.n_components) for belief in state.mixtures]
         variance = np.diagonal(cov, axis1=-2, axis2=-1)
@@ -175,7 +176,7 @@ class TargetMixtureFilter(
             return belief
         with step.failing_as(agent):
             if self.split_threshold is not None:
-                std = deviations(belief.moments()[1])
+                std = deviations(belief.cov)
                 belief = split_nonlinear(
                     belief,
                     partial(model.jacobian, t=t, dt=dt, std=std),
@@ -274,6 +275,7 @@ def settle_mixture(mixture: GaussianMixture, periods: Periods) -> GaussianMixtur
 
 
 def _move_means(mixture: GaussianMixture, means: Array) -> GaussianMixture:
+    """Return a mixture with other means, and with the roots of the covariances if it has them."""
     cached = {}
     if "factors" in vars(mixture):
         cached["factors"] = mixture.factors
@@ -375,7 +377,8 @@ class MixtureFilter(TargetMixtureFilter, FusesBeliefs[MixtureState]):
         after = []
         for agent, belief in enumerate(beliefs):
             # Observations stay with their agent.
-            updated, _ = self._condition(belief, agent, step.observations[agent], step)
+            observations = step.observations[agent]
+            updated, _second = self._condition(belief, agent, observations, step)
             after.append(updated)
         if step.has_fusion:
             after = self._fuse(after, step)

@@ -102,6 +102,8 @@ def read_observations(
     >>> [[o.value for o in agent] for agent in read_observations(f, [[1.5]], (), 0.0)]
     [[array([1.5])]]
     """
+    if are_observations(observations) and len(observations):
+        observations = _sort_by_agent(observations, f.n_agents)
     result: list[list[Observation]] = []
     for agent, entry in enumerate(list_by_agent(observations, f.n_agents)):
         name = f"observations[{agent}]"
@@ -117,6 +119,20 @@ def read_observations(
             if complete is not None:
                 checked.append(complete)
         result.append(checked)
+    return result
+
+
+def _sort_by_agent(
+    observations: Sequence[Observation], n_agents: int
+) -> list[list[Observation]]:
+    """Return Observations in any order as a list for each agent."""
+    result: list[list[Observation]] = [[] for _ in range(n_agents)]
+    for observation in observations:
+        if observation.agent >= n_agents:
+            raise ValueError(
+                f"observations must be of agents below {n_agents}, got {observation.agent}"
+            )
+        result[observation.agent].append(observation)
     return result
 
 
@@ -214,6 +230,7 @@ def match_delayed(
     for observation in delayed:
         t_obs = observation.t
         nearest = min(times, key=lambda time: abs(time - t_obs), default=np.inf)
+        # A billionth of the time is far more than rounding.
         tolerance = min(1e-9 * max(1.0, abs(t_obs)), 1e-3 * shortest)
         if abs(nearest - t_obs) > tolerance:
             stored = ", ".join(map(format_number, times)) or "none with lag = 0"
@@ -232,6 +249,7 @@ def match_delayed(
                 f"{sensor.kind} sensor"
             )
         complete = _complete(f, observation, state.runs, "delayed")
+        # NaN alone is no observation.
         if complete is not None:
             matched.append(complete.replace(t=nearest))
     return matched

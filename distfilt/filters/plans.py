@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from itertools import product
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..periods import Periods
 from ..sensors import Sensor
-from ..validation import Array, check_array, check_increasing, format_number
+from ..sensors.base import count_turns
+from ..validation import (
+    Array,
+    InvalidArgumentError,
+    check_array,
+    check_increasing,
+    format_number,
+)
 from ..validation.clocks import warn_of_clock
 from .observations import Observation, are_observations, list_by_agent
+from .repetition import is_equal_value
 
 if TYPE_CHECKING:
     from .base import Filter
@@ -50,7 +58,7 @@ class StepObservations(NamedTuple):
     True
     """
 
-    observations: Sequence[Any]
+    observations: Sequence[object]
     are_read: bool
 
 
@@ -118,12 +126,47 @@ def _plan_events(
     if wild is not None:
         warnings.warn(wild, RuntimeWarning, stacklevel=5)
     times = sorted(by_time)
+    near = _find_near_copies(state.t, times, by_time)
+    if near is not None:
+        warnings.warn(near, RuntimeWarning, stacklevel=5)
     # What does not fit is looked at again, and refused or completed, in its step.
     unread = {*times}
     if f.reads_by_default:
         unread = {e.t for e in _find_unfit(_sensors_of(f), _runs_of(state), events)}
-    entries = [StepObservations(by_time[t], t not in unread) for t in times]
+    entries = [StepObservations(by_time[t], are_read=t not in unread) for t in times]
     return np.array(times), iter(entries)
+
+
+_NEAR = 1e-3
+"""Copies of an event have times that differ by less than this part of the usual step."""
+
+
+def _find_near_copies(
+    start: float, times: list[float], by_time: dict[float, list[list[Observation]]]
+) -> str | None:
+    """Return a warning of events that are the same but for rounding of their time.
+
+    >>> events = {t: [[Observation(t, 0, [2.5])]] for t in (1.0, 1.0 + 1e-9, 2.0, 3.0)}
+    >>> _find_near_copies(0.0, sorted(events), events)
+    "observations must have one time to count once, got the same value of agent 0's sensor ..."
+    """
+    if len(times) < 2:
+        return None
+    gaps = np.diff(times, prepend=start)
+    usual = float(np.median(gaps))
+    for k in np.flatnonzero(gaps[1:] < _NEAR * usual).tolist():
+        pairs = zip(by_time[times[k]], by_time[times[k + 1]], strict=True)
+        for before, after in pairs:
+            for one, other in product(before, after):
+                if one.sensor is not other.sensor and one.sensor != other.sensor:
+                    continue
+                if is_equal_value(one.value, other.value):
+                    return (
+                        "observations must have one time to count once, got the same value of "
+                        f"agent {one.agent}'s sensor at t = {format_number(one.t)} s and "
+                        f"{other.t - one.t:.3g} s later: copies with rounded times count twice"
+                    )
+    return None
 
 
 def _find_unfit(
@@ -164,9 +207,17 @@ def _plan_series(
 ) -> Iterator[StepObservations]:
     """Take each agent's series (T, ...) apart into times."""
     series_by_agent: list[Series | None] = []
+    _refuse_ambiguous(observations, f.n_agents, grid.size)
     for series in list_by_agent(observations, f.n_agents):
         if series is None or isinstance(series, list | tuple):
             series_by_agent.append(series)
+        elif isinstance(series, np.ma.MaskedArray):
+            # As an array it would lose its mask.
+            raise InvalidArgumentError(
+                f"observations must be an array of real numbers for agent "
+                f"{len(series_by_agent)}, got MaskedArray: give y.filled(np.nan), a missing "
+                "number is NaN"
+            )
         else:
             # A table with named columns would give a column where a row is asked for.
             series_by_agent.append(np.atleast_1d(np.asarray(series)))
@@ -186,6 +237,20 @@ def _plan_series(
         lead = (grid.size, *_runs_of(state))
         shapes = [(*lead, s[0].dim) if len(s) == 1 else None for s in sensors]
     return _list_rows(grid, series_by_agent, shapes)
+
+
+def _refuse_ambiguous(observations: object, n_agents: int, n_times: int) -> None:
+    """Refuse an array whose first two axes may be agents and times, or times and agents."""
+    shape = getattr(observations, "shape", ())
+    if (
+        n_agents > 1
+        and len(shape) > 2
+        and shape[:2] == (n_agents, n_times) == shape[1::-1]
+    ):
+        raise ValueError(
+            f"observations must be a list of the agents' series where there are as many times as "
+            f"agents, {n_times}, got an array of shape {shape}: give list(y), agents first"
+        )
 
 
 def _list_rows(
@@ -213,13 +278,13 @@ def _list_rows(
     for k, t in enumerate(grid.tolist()):
         rows = [None if series is None else series[k] for series in series_by_agent]
         if not fits or not is_read[k]:
-            yield StepObservations(rows, False)
+            yield StepObservations(rows, are_read=False)
             continue
         read = [
             [] if row is None else [Observation.construct(t, agent, row)]
             for agent, row in enumerate(rows)
         ]
-        yield StepObservations(read, True)
+        yield StepObservations(read, are_read=True)
 
 
 def _sensors_of(f: Filter[AnyState]) -> SensorLists:
@@ -246,7 +311,7 @@ def _warn_of_degrees(agent_sensors: SensorLists, series: Series, agent: int) -> 
         # All values of the only sensor at once.
         if len(sensors) == 1 and series.shape[-1:] == (sensors[0].dim,):
             values = series.reshape(-1, sensors[0].dim)
-            entries = [Observation.construct(0.0, agent, values)]
+            entries = [Observation.construct(t=0.0, agent=agent, value=values)]
     elif any(sensor.wraps for sensor in sensors):
         entries = _list_entries(sensors, series, agent)
     text = find_degrees(agent_sensors, entries)
@@ -266,7 +331,9 @@ def _list_entries(
             elif one is not None and len(sensors) == 1:
                 value = np.asarray(one)
                 if value.dtype.kind in "fiu" and value.shape[-1:] == (sensors[0].dim,):
-                    result.append(Observation.construct(0.0, agent, value))
+                    result.append(
+                        Observation.construct(t=0.0, agent=agent, value=value)
+                    )
     return result
 
 
@@ -305,25 +372,10 @@ def find_degrees(
         observed = np.nan_to_num(observed)
         # Angles below four turns need no closer look.
         large = observed[(np.abs(observed) > 25).any(axis=-1)]
-        turns = _count_turns(sensor, large) if large.size else 0.0
+        turns = count_turns(sensor, large) if large.size else 0.0
         if turns > 4:
             return (
                 f"observations[{agent}] must be angles in rad, got some {turns:.0f} turns off "
                 f"by a sensor of kind {sensor.kind!r}: are they in degrees?"
             )
     return None
-
-
-def _count_turns(sensor: Sensor, observed: Array) -> float:
-    """Return by how many of its turns a sensor's values (N, m) are off, at most."""
-    # y - r(y, 0) is the multiple of the period that wrapping takes off.
-    shift = np.abs(observed - sensor.residual(observed, 0 * observed))
-    if sensor.periods:
-        # A line turns twice while a direction turns once; a period of 360 is in degrees.
-        periods = [p or np.inf for p in cast(Periods, sensor.periods)]
-        turn = np.maximum(periods, 2 * np.pi)
-        return float((shift / turn).max(initial=0.0))
-    full = np.full((1, sensor.dim), 360.0)
-    if np.abs(sensor.residual(full, 0 * full)).min() < 1e-6:
-        return 0.0  # a residual of one's own, in degrees
-    return float(shift.max(initial=0.0) / (2 * np.pi))

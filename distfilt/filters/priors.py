@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..ensembles import draw, sample_covariance
 from ..mixtures import GaussianMixture
+from ..periods import Periods, fold, fold_torn
 from ..validation import (
     Array,
     call_user,
@@ -53,19 +54,40 @@ __all__ = [
 
 def _is_mean_and_cov(prior: object) -> TypeGuard[tuple[ArrayLike, ArrayLike]]:
     """Whether a prior is (mean, cov), and not a list of two members."""
-    if type(prior) is list:
-        for entry in prior:
-            if type(entry) is tuple and np.ndim(entry[-1]) > 1:
-                raise ValueError(
-                    "prior must be one for all agents, got a list of (mean, cov)"
-                )
-    if not isinstance(prior, tuple | list) or len(prior) != 2:
+    if not isinstance(prior, tuple | list):
         return False
-    return isinstance(prior, tuple) or np.ndim(prior[0]) < np.ndim(prior[1])
+    if any(_is_pair(entry) for entry in prior):
+        raise ValueError("prior must be one for all agents, got a list of (mean, cov)")
+    if len(prior) != 2:
+        return False
+    return isinstance(prior, tuple) or _count_axes(prior[0]) < _count_axes(prior[1])
+
+
+def _is_pair(entry: object) -> TypeGuard[Sequence[ArrayLike]]:
+    """Whether an entry of a list is (mean, cov), a vector and a matrix.
+
+    >>> _is_pair(([0.0], [[1.0]])), _is_pair([[1.0, 0.0], [0.0, 1.0]])
+    (True, False)
+    """
+    if not isinstance(entry, tuple | list) or len(entry) != 2:
+        return False
+    return _count_axes(entry[0]) < 2 and _count_axes(entry[1]) == 2
+
+
+def _count_axes(value: ArrayLike) -> int:
+    """Return the number of an array's axes; -1 for entries of different lengths."""
+    try:
+        return np.ndim(value)
+    except ValueError:
+        return -1
 
 
 def prior_moments(
-    prior: Prior, dim: int, definiteness: str = "semidefinite"
+    prior: Prior,
+    dim: int,
+    definiteness: str = "semidefinite",
+    *,
+    periods: Periods = (),
 ) -> tuple[Array, Array]:
     """Return the mean (d,) and covariance (d, d) of a prior that has them.
 
@@ -77,14 +99,22 @@ def prior_moments(
         Size d of the state.
     definiteness : {"semidefinite", "definite"}
         The condition that the covariance has to meet.
+    periods : tuple
+        The model's periods: members and mixtures are brought onto one branch first.
 
     Examples
     --------
     >>> from scipy.stats import multivariate_normal
     >>> prior_moments(multivariate_normal([1.0], [[4.0]]), 1)
     (array([1.]), array([[4.]]))
+
+    Members on both sides of a cut:
+
+    >>> mean, cov = prior_moments([[6.2], [0.1], [6.1], [0.2]], 1, periods=(2 * np.pi,))
+    >>> mean.round(2), cov.round(2)
+    (array([0.01]), array([[0.03]]))
     """
-    mean, cov = _find_moments(prior, dim)
+    mean, cov = _find_moments(prior, dim, periods)
     mean = check_array(np.atleast_1d(mean), "prior", (dim,))
     cov = check_array(cov, "prior")
     # In one dimension a scalar variance serves as covariance.
@@ -108,10 +138,13 @@ def prior_moments(
     return mean, cov
 
 
-def _find_moments(prior: Any, dim: int) -> tuple[ArrayLike, ArrayLike]:
+def _find_moments(
+    prior: Any, dim: int, periods: Periods
+) -> tuple[ArrayLike, ArrayLike]:
     """Return the mean and covariance of a prior, unchecked."""
     if isinstance(prior, GaussianMixture):
-        return prior.moments()
+        means = fold(prior.means, periods, prior.weights)
+        return GaussianMixture(prior.weights, means, prior.covs).moments()
     if hasattr(prior, "rvs"):
         # A scalar distribution of scipy has a variance; either may be a method.
         mean = prior.mean
@@ -130,6 +163,7 @@ def _find_moments(prior: Any, dim: int) -> tuple[ArrayLike, ArrayLike]:
     members = check_array(prior, "prior", ("N", dim))
     if len(members) <= dim:
         raise ValueError(f"prior must have more than {dim} members, got {len(members)}")
+    members = fold_torn(members, periods)
     return members.mean(axis=0), sample_covariance(members)
 
 
@@ -169,8 +203,8 @@ def draw_members(
 def split_by_agent(prior: Prior, dim: int, n_agents: int) -> list[_OnePrior] | None:
     """Return the priors of a list with one for each agent; None if the prior is one for all.
 
-    A list of priors has ``(mean, cov)`` tuples, distributions, mixtures, functions or arrays of
-    members (N, d).
+    A list of priors has ``(mean, cov)`` pairs, distributions, mixtures, functions or arrays of
+    members (N, d); pairs may be in a tuple.
 
     >>> normal = ([0.0, 0.0], np.eye(2))
     >>> (
@@ -182,39 +216,49 @@ def split_by_agent(prior: Prior, dim: int, n_agents: int) -> list[_OnePrior] | N
     Traceback (most recent call last):
     ValueError: prior must be one for all or a list with one for each of 2 agents, got 1
     """
-    if type(prior) is not list:
+    entries: list[Any] = list(prior) if isinstance(prior, list | tuple) else []
+    # A tuple is a prior (mean, cov), unless its entries are such pairs.
+    is_prior_of_all = type(prior) is tuple and not all(map(_is_pair, entries))
+    if not entries or is_prior_of_all:
         return None
-    are_priors = [_is_prior(entry, dim) for entry in prior]
+    are_priors = [_is_prior(entry, dim) for entry in entries]
     # Of [mean, cov] the second alone is an array with two axes: that is one prior for all.
-    are_arrays = all(isinstance(e, np.ndarray) for e in prior)
+    are_arrays = all(isinstance(e, np.ndarray) for e in entries)
     if are_arrays and not all(are_priors) or not any(are_priors):
         return None
-    if len(prior) != n_agents:
+    if len(entries) != n_agents:
         raise ValueError(
             f"prior must be one for all or a list with one for each of {n_agents} agents, "
-            f"got {len(prior)}"
+            f"got {len(entries)}"
         )
-    for agent, entry in enumerate(prior):
+    for agent, entry in enumerate(entries):
         if not _is_prior(entry, dim):
             raise ValueError(
                 f"prior[{agent}] must be a prior as the other agents have one, got "
                 f"{type(entry).__name__}"
             )
-    return list(prior)
+    return entries
 
 
 def _is_prior(entry: object, dim: int) -> bool:
     """Whether an entry of a list is a prior by itself, and not a member of one."""
     if isinstance(entry, GaussianMixture) or hasattr(entry, "rvs") or callable(entry):
         return True
+    if _is_pair(entry):
+        return True
     if type(entry) is tuple:
         # A member of one component is no pair of numbers, but (mean, variance) may be.
-        return len(entry) == 2 and (dim == 1 or np.ndim(entry[1]) > 1)
+        return len(entry) == 2 and dim == 1
     return isinstance(entry, np.ndarray) and entry.ndim == 2
 
 
 def moments_by_agent(
-    prior: Prior, dim: int, n_agents: int, definiteness: str = "semidefinite"
+    prior: Prior,
+    dim: int,
+    n_agents: int,
+    definiteness: str = "semidefinite",
+    *,
+    periods: Periods = (),
 ) -> tuple[Array, Array]:
     """Return mean and covariance of a prior, (d,) and (d, d), with an axis of agents for a list.
 
@@ -224,30 +268,28 @@ def moments_by_agent(
     """
     priors = split_by_agent(prior, dim, n_agents)
     if priors is None:
-        return prior_moments(prior, dim, definiteness)
-    moments = [prior_moments(one, dim, definiteness) for one in priors]
-    return np.array([m for m, _ in moments]), np.array([p for _, p in moments])
+        return prior_moments(prior, dim, definiteness, periods=periods)
+    moments = [prior_moments(one, dim, definiteness, periods=periods) for one in priors]
+    means = np.array([mean for mean, _cov in moments])
+    return means, np.array([cov for _mean, cov in moments])
 
 
 def prior_mixtures(
-    prior: Prior, dim: int, n_agents: int
+    prior: Prior, dim: int, n_agents: int, *, periods: Periods = ()
 ) -> tuple[GaussianMixture, ...]:
     """Return a mixture for each agent, of one prior for all or of a list with one each.
 
     >>> [mixture.n_components for mixture in prior_mixtures(([0.0], [[1.0]]), 1, 2)]
     [1, 1]
     """
-    priors = prior if isinstance(prior, list) else [prior] * n_agents
-    if len(priors) != n_agents:
-        raise ValueError(
-            f"prior must be one for all or for each of {n_agents}, got {len(priors)}"
-        )
+    priors: list[Any] = split_by_agent(prior, dim, n_agents) or [prior] * n_agents
     mixtures = []
     for one in priors:
         if isinstance(one, GaussianMixture):
             mixture = one
         else:
-            mixture = GaussianMixture.gaussian(*prior_moments(one, dim, "definite"))
+            moments = prior_moments(one, dim, "definite", periods=periods)
+            mixture = GaussianMixture.gaussian(*moments)
         if mixture.dim != dim:
             raise ValueError(f"prior must have dimension {dim}, got {mixture.dim}")
         mixtures.append(mixture)

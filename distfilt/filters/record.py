@@ -13,7 +13,7 @@ from collections.abc import (
 )
 from dataclasses import dataclass, field
 from itertools import groupby, islice
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,7 +29,7 @@ from .states import AnyState, SensorState, State, stack_states
 if TYPE_CHECKING:
     import xarray
 
-    from .base import Filter
+    from .base import Filter, SensorFilter
 
     TruthOfTime = Callable[[float], ArrayLike]
     TruthSeries = ArrayLike | TruthOfTime
@@ -204,7 +204,8 @@ def record_run(
     # The truth is checked before the first step.
     known_truth = _read_truth(recording, names, (times.size, *runs), len(agents), times)
     keep = _read_keep(recording.keep, f, start, known_truth)
-    series, counts, last = _collect_series(f, start, believed, known_truth, keep)
+    collected = _collect_series(f, start, believed, known_truth, keep)
+    series = collected.series
 
     # Axes: time first, then the runs, then the agents.
     run_axes = ["run"] if len(runs) == 1 else [f"run{i}" for i in range(len(runs))]
@@ -218,7 +219,7 @@ def record_run(
         attributes = {"long_name": meaning, "units": unit}
         variables[name] = axes.get(name, lead), values, attributes
     for name in _LEDGER_FIELDS:
-        variables |= _count_messages(name, counts[name])
+        variables |= _count_messages(name, collected.counts[name])
     if keep is not None:
         variables = {name: variables[name] for name in variables if name in keep}
     coords = {
@@ -231,8 +232,19 @@ def record_run(
     # `encoding` is the only place that xarray hands on to copies and selections, and leaves out
     # of tables and files. The agents and the last mean tell a part of the run from all of it.
     mean = np.array(series["mean"][-1]) if times.size else None
-    run.encoding["final_state"] = last, agents, mean
+    run.encoding["final_state"] = collected.last, agents, mean
     return run
+
+
+class _Collected(NamedTuple):
+    """The recorded arrays, (T, ...) each, the ledgers' counts, and the last state.
+
+    The counts, (T + 1, ...) each, begin with those of the state before the run.
+    """
+
+    series: dict[str, Array]
+    counts: dict[str, Array]
+    last: State
 
 
 def _collect_series(
@@ -241,11 +253,10 @@ def _collect_series(
     believed: Iterable[Believed[AnyState]],
     known: _KnownTruth | None,
     keep: Collection[str] | None,
-) -> tuple[dict[str, Array], dict[str, Array], State]:
-    """Return the recorded arrays, (T, ...) each, the ledgers' counts, and the last state.
+) -> _Collected:
+    """Collect the numbers of a run's states and beliefs.
 
-    The counts, (T + 1, ...) each, begin with those of the state before the run. Only variables to
-    `keep` are collected, and the variance, which the spread needs.
+    Only variables to `keep` are collected, and the variance, which the spread needs.
     """
     rows: list[dict[str, Array]] = []
     counts = [_read_ledgers([start.ledger])]
@@ -253,11 +264,11 @@ def _collect_series(
     last = start
     for block in _blocks(believed, f.batched_summary):
         # The ledgers are those of the states, the estimates those of the (smoothed) beliefs.
-        states = [state for state, _ in block]
+        states = [state for state, _belief in block]
         counts.append(_read_ledgers([state.ledger for state in states]))
         last = states[-1]
         is_single = len(block) == 1
-        beliefs = [belief for _, belief in block]
+        beliefs = [belief for _state, belief in block]
         summary = f.summarize(beliefs[0] if is_single else stack_states(beliefs))
         row = _read_summary(summary)
         # Numbers of the steps themselves, where the filter has a gate or scores observations.
@@ -279,16 +290,18 @@ def _collect_series(
         first += len(block)
     totals = {name: np.concatenate([c[name] for c in counts]) for name in counts[0]}
     if not rows:
-        return _read_nothing(f, start, known), totals, last
+        return _Collected(_read_nothing(f, start, known), totals, last)
     series = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
-    if known is not None:
-        warn_of_wrapped_truth(f, series["mean"], known.values)
+    # Filters that have periods, or lack them, have a model of motion.
+    if known is not None and getattr(f, "lacks_periods", False):
+        model = cast("SensorFilter[State]", f).model
+        warn_of_wrapped_truth(model, series["mean"], known.values)
     # sqrt(tr P); NaN fills agents' missing components, and failed runs are NaN altogether.
     variance = series["variance"]
     spread = np.sqrt(np.nansum(variance, axis=-1))
     is_missing = np.isnan(variance).all(axis=-1)
     series["spread"] = np.where(is_missing, np.nan, spread)
-    return series, totals, last
+    return _Collected(series, totals, last)
 
 
 def _read_ledgers(ledgers: list[Ledger]) -> dict[str, Array]:
@@ -405,7 +418,7 @@ def _read_truth(
     times: Array,
 ) -> _KnownTruth | None:
     """Check the truth, whose shape is (T, *runs) for each component."""
-    truth: Any = recording.truth
+    truth = recording.truth
     if truth is None:
         if recording.scored is not None:
             raise ValueError("scored must be None without a truth, got components")
@@ -413,7 +426,9 @@ def _read_truth(
     # A table whose columns are components says itself which is which.
     columns = getattr(truth, "columns", None)
     if columns is not None and set(columns) <= set(names):
-        truth = {name: truth[name] for name in columns}
+        # It is read like a mapping.
+        table = cast("Mapping[str, TruthSeries]", truth)
+        truth = {name: table[name] for name in columns}
     if isinstance(truth, Mapping):
         values, components = _read_components(truth, names, shape, n_agents, times)
     else:
@@ -431,13 +446,15 @@ def _read_truth(
     return _KnownTruth(values, components, recording.scores)
 
 
-def _read_series(entry: Any, name: str, times: Array) -> Array:
+def _read_series(entry: TruthSeries, name: str, times: Array) -> Array:
     """Return a series, or the values of a function at the times; NaN where nothing is known.
 
     Any shape is accepted here: the caller compares it with those that it can use.
     """
     if callable(entry):
-        values = [np.asarray(call_user(entry, t)) for t in times.tolist()]
+        values = [
+            check_array(call_user(entry, t), name, finite=False) for t in times.tolist()
+        ]
         shapes = {value.shape for value in values}
         if len(shapes) > 1:
             raise ValueError(
@@ -448,7 +465,7 @@ def _read_series(entry: Any, name: str, times: Array) -> Array:
 
 
 def _read_components(
-    truth: Mapping[str, object],
+    truth: Mapping[str, TruthSeries],
     names: Sequence[str],
     shape: tuple[int, ...],
     n_agents: int,
@@ -472,16 +489,20 @@ def _read_components(
     return values, np.array([names.index(name) for name in truth], dtype=np.intp)
 
 
-def _read_scored(scored: Any, names: Sequence[str], n_agents: int) -> Components:
+def _read_scored(
+    scored: Sequence[str] | Sequence[Sequence[str]],
+    names: Sequence[str],
+    n_agents: int,
+) -> Components:
     """Return the index of the components that are scored together, (k,) or (A, k)."""
     if isinstance(scored, str):
         raise InvalidArgumentError(
             f"scored must be a sequence of names of components, got {scored!r}"
         )
-    rows = list(scored)
+    rows: list[Sequence[str]] = list(scored)
     is_common = all(isinstance(name, str) for name in rows)
     if is_common:
-        rows = [rows]
+        rows = [cast(list[str], rows)]
     elif len(rows) != n_agents:
         raise ValueError(
             f"scored must have one list for each of {n_agents} agents, got {len(rows)}"
@@ -593,7 +614,7 @@ def final_state(run: xarray.Dataset) -> State:
     """
     encoding = getattr(run, "encoding", {})
     if "final_state" in encoding and "mean" in run and not run["time"].size:
-        state, _, last_mean = encoding["final_state"]
+        state, _agents, last_mean = encoding["final_state"]
         # A run without a time ends where it starts; a selection of none does not.
         if last_mean is None:
             return cast(State, state)

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..sensors import Sensor
 from ..validation import Array
 from .observations import Observation
 
-__all__ = ["Assimilated", "drop_repeated"]
+__all__ = ["Assimilated", "drop_repeated", "is_equal_value"]
 
 Assimilated = tuple[float, int, int | Sensor, Array, tuple[float, ...]]
 """Time, agent, sensor (its number, or itself), value and metadata of an observation."""
+
+
+class WithoutRepeats(NamedTuple):
+    """Present and delayed observations without repetitions, and those that were left out."""
+
+    observations: list[list[Observation]]
+    delayed: list[Observation]
+    repeated: list[Observation]
 
 
 def drop_repeated(
@@ -21,8 +31,10 @@ def drop_repeated(
     delayed: Sequence[Observation],
     assimilated: Iterable[Assimilated],
     dim: int,
-) -> tuple[list[list[Observation]], list[Observation], list[Observation]]:
+) -> WithoutRepeats:
     """Leave out observations that occur twice, or have been assimilated before.
+
+    A copy may have gone through single precision.
 
     Parameters
     ----------
@@ -35,42 +47,64 @@ def drop_repeated(
     dim : int
         Size of the state, to compare sensors that come with an observation.
 
-    Returns
-    -------
-    observations, delayed, repeated : list
-        The two lists without what they repeat, and the observations that were left out.
-
     Examples
     --------
     >>> one, other = Observation(1.0, 0, [2.0]), Observation(1.0, 0, [2.5])
-    >>> kept, _, repeated = drop_repeated([[one, other, one]], [], (), 1)
-    >>> [float(o.value[0]) for o in kept[0]], len(repeated)
+    >>> result = drop_repeated([[one, other, one]], [], (), dim=1)
+    >>> [float(o.value[0]) for o in result.observations[0]], len(result.repeated)
     ([2.0, 2.5], 1)
     """
     # Candidates by time, agent and value; sensors are compared only where these agree.
-    known: dict[Hashable, list[tuple[int | Sensor, tuple[float, ...]]]] = {}
+    known: dict[Hashable, list[tuple[int | Sensor, Array, tuple[float, ...]]]] = {}
     for t, agent, sensor, value, metadata in assimilated:
         key = t, agent, _fingerprint(value)
-        known.setdefault(key, []).append((sensor, metadata))
+        known.setdefault(key, []).append((sensor, value, metadata))
     repeated: list[Observation] = []
 
     def keep_new(entries: Sequence[Observation]) -> list[Observation]:
+        """Return the observations that are not known yet; note them, and those that repeat."""
         new = []
         for o in entries:
             same = known.setdefault((o.t, o.agent, _fingerprint(o.value)), [])
-            if any(_is_same(o, sensor, metadata, dim) for sensor, metadata in same):
+            if any(
+                is_equal_value(o.value, value) and _is_same(o, sensor, metadata, dim)
+                for sensor, value, metadata in same
+            ):
                 repeated.append(o)
                 continue
-            same.append((o.sensor, o.metadata))
+            same.append((o.sensor, o.value, o.metadata))
             new.append(o)
         return new
 
-    kept = [keep_new(of_agent) for of_agent in observations]
-    return kept, keep_new(delayed), repeated
+    new_observations = [keep_new(of_agent) for of_agent in observations]
+    return WithoutRepeats(new_observations, keep_new(delayed), repeated)
+
+
+def is_equal_value(value: Array, other: Array) -> bool:
+    """Whether two values are equal, or one is the other in single precision.
+
+    >>> is_equal_value(np.array([1.1]), np.array([np.float32(1.1)], dtype=float))
+    True
+    >>> is_equal_value(np.array([1.1]), np.array([1.1 + 1e-8]))
+    False
+    """
+    if np.array_equal(value, other, equal_nan=True):
+        return True
+    return any(
+        np.array_equal(_to_single(a), b, equal_nan=True)
+        for a, b in ((value, other), (other, value))
+    )
+
+
+def _to_single(value: Array) -> NDArray[np.float32]:
+    """Return a value rounded to single precision, in which it may be infinite."""
+    with np.errstate(over="ignore", under="ignore"):
+        return value.astype(np.float32)
 
 
 def _fingerprint(value: Array) -> tuple[tuple[int, ...], bytes]:
-    return value.shape, value.tobytes()
+    """Return a key that arrays of the same shape and numbers, in single precision, share."""
+    return value.shape, _to_single(value).tobytes()
 
 
 def _is_same(

@@ -101,7 +101,7 @@ def reset_gaussian(state: Gaussians, reset: Reset) -> Gaussians:
     d = state.dim
     rows = (..., reset.agents, slice(None))
     present = state.means[rows]
-    slope, _ = difference_with_error(reset.value, present, np.subtract)
+    slope, _error = difference_with_error(reset.value, present, np.subtract)
     means = state.joint_means.copy()
     covs = state.joint_covariances.copy()
     # x' = T x + e: the identity, with the derivative of the new values in their rows.
@@ -127,7 +127,7 @@ def reset_members(
     rng: np.random.Generator,
 ) -> Members:
     """Return a state of members with new present components; the past keeps the former ones."""
-    name, _ = state.belief_field
+    name, _axes = state.belief_field
     members = state.belief.copy()
     # e = L z, drawn for all agents, so that an agent's draws do not depend on which are chosen.
     normal = draw_normal((*members.shape[:-1], len(reset.components)), rng)

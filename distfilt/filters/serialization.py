@@ -147,7 +147,7 @@ def _decode_rng(state: Any, seed: Any) -> np.random.Generator:
 
 def _find_class(name: str) -> type:
     """Find a dataclass of this package; a file cannot name anything else to be imported."""
-    module, _, qualname = name.partition(":")
+    module, _colon, qualname = name.partition(":")
     cls: object = None
     if module.startswith("distfilt."):
         cls = getattr(import_module(module), qualname)

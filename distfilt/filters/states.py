@@ -214,13 +214,13 @@ class SensorState(State):
     @property
     def runs(self) -> tuple[int, ...]:
         """Leading axes: independent runs of the network."""
-        _, axes = self.belief_field
+        _name, axes = self.belief_field
         return self.belief.shape[: 1 - len(axes)]
 
     @property
     def times(self) -> tuple[float, ...]:
         """The earlier times whose beliefs are kept, oldest first."""
-        return tuple([t for t, _ in self.past])
+        return tuple([t for t, _belief in self.past])
 
     @property
     def past(self) -> Past:
@@ -255,7 +255,7 @@ class SensorState(State):
         True
         True
         """
-        name, _ = self.belief_field
+        name, _axes = self.belief_field
         states = []
         for t, belief in self.past:
             states.append(

@@ -21,7 +21,7 @@ from numpy.typing import DTypeLike, NDArray
 from ..derivatives import call_derivative, needs_differences
 from ..linalg import cholesky, deviations, log_det, quadratic_form
 from ..models import Model
-from ..periods import check_sensor, gather
+from ..periods import Periods, check_sensor, fold, gather
 from ..sensors import LikelihoodSensor, Sensor
 from ..validation import Array, Indices, Mask, call_user, format_number
 from ..validation.batching import name_of_check
@@ -592,12 +592,14 @@ class Step(Generic[S]):
 
     # What is said once ----------------------------------------------------------------
 
-    def warn_once(self, key: str, text: str) -> None:
+    def warn_once(
+        self, key: str, text: str, category: type[RuntimeWarning] = RuntimeWarning
+    ) -> None:
         """Warn, unless this state or one before it has led to the same warning."""
         if key in self.warned:
             return
         self.warned = (*self.warned, key)
-        warnings.warn(text, RuntimeWarning, stacklevel=4)
+        warnings.warn(text, category, stacklevel=4)
 
     def note_unseen(self, group: Received, is_unseen: Mask, reason: str) -> None:
         """Count the observed numbers (*runs, G, M) that no update can use, and say so once."""
@@ -839,10 +841,13 @@ class Received:
             means, covs = sensor.predict_moments(states[..., part.agents, :, :])
             # E[y] = Σ wᵢ mᵢ and Cov[y] = Σ wᵢ (Rᵢ + (mᵢ - E[y]) (mᵢ - E[y])ᵀ)
             w = weights[..., part.agents, :]
+            # Angles on one branch, and that on the branch of the observed value
+            means = fold(means, cast(Periods, sensor.periods), w)
             centre = np.einsum("...n,...nm->...m", w, means)
             anomalies = means - centre[..., None, :]
             covs = covs + anomalies[..., :, None] * anomalies[..., None, :]
-            mean[(..., *part.cells)] = centre
+            observed = self.target[(..., *part.cells)]
+            mean[(..., *part.cells)] = sensor.bring_near(centre, observed)
             cov[_block_of(part)] = np.einsum("...n,...nij->...ij", w, covs)
         return mean, cov
 
@@ -960,7 +965,8 @@ class Received:
         for part in self.parts:
             rows = (..., part.agents, slice(None), slice(None))
             before = None if previous is None else previous[rows]
-            check_sensor(part.sensor, model, states[rows], before)
+            observed = self.target[(..., *part.cells)]
+            check_sensor(part.sensor, model, states[rows], before, observed)
 
     def _predict_part(
         self, part: _Part, states: Array, previous: Array | None, branch: str

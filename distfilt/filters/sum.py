@@ -5,13 +5,13 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from ..gaussians.single import condition
 from ..linalg import cholesky, log_det, log_sum_exp, quadratic_form, symmetrise
-from ..periods import settle
+from ..periods import fold, settle
 from ..validation import Array, Rng
 from .base import SensorFilter
 from .gaussian import GaussianFamily, GaussianState
@@ -75,12 +75,16 @@ class GaussianSumState(SensorState):
     @property
     def means(self) -> Array:
         """Means of the whole mixtures, (*runs, A, d)."""
-        return _mix(self.weights, self.component_means, self.component_covariances)[0]
+        return self._moments.mean
 
     @property
     def covariances(self) -> Array:
         """Covariances of the whole mixtures, (*runs, A, d, d)."""
-        return _mix(self.weights, self.component_means, self.component_covariances)[1]
+        return self._moments.cov
+
+    @property
+    def _moments(self) -> _Moments:
+        return _mix(self.weights, self.component_means, self.component_covariances)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +141,9 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         self, prior: Prior, runs: tuple[int, ...], rng: Rng | None
     ) -> dict[str, object]:
         """Return the components of the prior, the same for all runs."""
-        mixtures = prior_mixtures(prior, self.model.dim, self.n_agents)
+        mixtures = prior_mixtures(
+            prior, self.model.dim, self.n_agents, periods=self.periods
+        )
         counts = {mixture.n_components for mixture in mixtures}
         if len(counts) > 1:
             raise ValueError(
@@ -145,8 +151,10 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
                 f"{sorted(counts)}"
             )
         # One row of components for each agent; a weight of zero gets a finite logarithm.
+        means = np.array([mixture.means for mixture in mixtures])
+        weights = np.array([mixture.weights for mixture in mixtures])
         arrays = {
-            "component_means": np.array([mixture.means for mixture in mixtures]),
+            "component_means": self._settle(means, weights),
             "component_covariances": np.array([mixture.covs for mixture in mixtures]),
             "log_weights": np.log([np.exp(_LEAST) + m.weights for m in mixtures]),
         }
@@ -162,17 +170,20 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
     def next_state(self, step: Step[Any]) -> Any:
         """Forecast all components, condition and weight them by the observations."""
         means, covs = self._forecast_components(step)
-        log_weights = step.keep_failed(step.state.log_weights, 0.0).copy()
-        for _, group in step.received():
+        log_weights = step.keep_failed(step.state.log_weights, old=0.0).copy()
+        for _place, group in step.received():
             self._condition_components(means, covs, log_weights, group, step)
-        if self.periods:
-            # A mixture lies on one branch of each circle.
-            means = settle(means, self.periods, np.exp(log_weights))
         return step.end(
-            component_means=means,
+            component_means=self._settle(means, np.exp(log_weights)),
             component_covariances=symmetrise(covs),
             log_weights=log_weights,
         )
+
+    def _settle(self, means: Array, weights: Array) -> Array:
+        """Bring means (..., L, d) of mixtures onto one branch of each circle."""
+        if not self.periods:
+            return means
+        return settle(fold(means, self.periods, weights), self.periods, weights)
 
     def summarize(self, state: Any) -> Summary:
         """Return moments of the mixtures, and the effective numbers of their components."""
@@ -205,8 +216,8 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         means = np.array(means.swapaxes(-3, -2))
         covs = np.array(covs.swapaxes(-4, -3))
         # Failed runs get harmless Gaussians, so that the batch can go on.
-        unit = np.eye(state.dim)
-        return step.check_forecast(means, 0.0), step.check_forecast(covs, unit)
+        means = step.check_forecast(means, old=0.0)
+        return means, step.check_forecast(covs, old=np.eye(state.dim))
 
     def _condition_components(
         self,
@@ -221,12 +232,21 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         mean = means[..., rows, :, :]
         cov = covs[..., rows, :, :, :]
         logs = log_weights[..., rows, :]
-        predicted, slope, extra = self._predict_components(mean, cov, group)
+        predictions = self._predict_components(mean, cov, group)
+        predicted = predictions.values
+        slope = predictions.slopes
         is_blind = np.isnan(predicted)
+        is_unseen = np.asarray(is_blind.all(axis=-2))
         reason = "no component can see"
-        step.note_unseen(group, np.asarray(is_blind.all(axis=-2)), reason)
+        if self.linearization == "extended":
+            # Nothing moves, and components that predict the same keep their weights.
+            is_flat = ~slope.any(axis=(-3, -1)) & (np.ptp(predicted, axis=-2) == 0)
+            if is_flat.any():
+                reason = "the sensor's derivative is zero at every component"
+            is_unseen |= is_flat
+        step.note_unseen(group, is_unseen, reason)
         # The gate tests the whole mixture's prediction: Σ w_l N(y; h(m_l), H_l P_l H_lᵀ).
-        predicted_cov = slope @ cov @ slope.mT + extra
+        predicted_cov = slope @ cov @ slope.mT + predictions.extra_covs
         group = step.gate(
             group,
             _predict_moments,
@@ -241,24 +261,27 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         # A component that cannot see an observation contradicts it, if others can see it.
         is_seen = ~is_blind.all(axis=-2, keepdims=True) & ~np.isnan(target)
         contradicts = (is_blind & is_seen).any(axis=-1)
-        noise = (group.noise[:, None] if group.noise.ndim == 3 else group.noise) + extra
+        # A covariance for each agent serves all of the agent's components.
+        noise = group.noise[:, None] if group.noise.ndim == 3 else group.noise
+        noise = noise + predictions.extra_covs
         prior = np.where(contradicts, _LEAST, logs)
         # All components of all agents and runs at once, or run by run if one fails.
-        new = step.apply(
+        new_means, new_covs, new_logs, log_likelihoods = step.apply(
             _condition_bank,
             (mean, cov, prior, innovation, slope, noise),
             (mean, cov, logs, np.zeros(logs.shape[:-1])),
             group.agents,
         )
-        means[..., rows, :, :], covs[..., rows, :, :, :] = new[:2]
-        log_weights[..., rows, :] = new[2]
+        means[..., rows, :, :] = new_means
+        covs[..., rows, :, :, :] = new_covs
+        log_weights[..., rows, :] = new_logs
         if step.scores:
-            step.add_log_likelihood(new[3], group.agents)
+            step.add_log_likelihood(log_likelihoods, group.agents)
 
     def _predict_components(
         self, mean: Array, cov: Array, group: Received
-    ) -> tuple[Array, Array, Array]:
-        """Return predictions (*runs, G, L, M), slopes, and extra covariances of components."""
+    ) -> _Predictions:
+        """Predict a group's observations by every component."""
         # Components stand among the runs, so that a group predicts for each of them.
         mean = np.ascontiguousarray(mean.swapaxes(-3, -2))
         cov = np.ascontiguousarray(cov.swapaxes(-4, -3))
@@ -270,7 +293,7 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
             wide.jacobian,
             mean,
             cov,
-            group.linear,
+            is_linear=group.linear,
         )
         # Where the derivative does not exist the sensor cannot be used either.
         is_blind = np.asarray(np.isnan(slope).any(axis=-1))
@@ -278,11 +301,30 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         slope = np.where(is_blind[..., None], 0.0, slope)
         if extra is None:
             extra = np.zeros((*shape, shape[-1]))
-        return (
-            predicted.swapaxes(-3, -2),
-            slope.swapaxes(-4, -3),
-            extra.swapaxes(-4, -3),
+        # Back behind the agents
+        return _Predictions(
+            values=predicted.swapaxes(-3, -2),
+            slopes=slope.swapaxes(-4, -3),
+            extra_covs=extra.swapaxes(-4, -3),
         )
+
+
+class _Predictions(NamedTuple):
+    """Predictions (*runs, G, L, M) by the components of G agents, slopes and extra covariances.
+
+    The latter are the covariances beyond the linear part: zero for the extended filter.
+    """
+
+    values: Array
+    slopes: Array
+    extra_covs: Array
+
+
+class _Moments(NamedTuple):
+    """Mean (..., d) and covariance (..., d, d) of mixtures."""
+
+    mean: Array
+    cov: Array
 
 
 def _condition_bank(
@@ -292,9 +334,13 @@ def _condition_bank(
     innovation: Array,
     slope: Array,
     noise: Array,
-    *_: object,
+    *_others: object,
 ) -> tuple[Array, ...]:
-    """Condition components (..., L, d), and return normalised log-weights and log p(y) too."""
+    """Condition components (..., L, d) on their innovations.
+
+    Returns the new means and covariances, the normalised log-weights, and log p(y), (...). The
+    shared array and the generator that :meth:`Step.apply` adds are not needed.
+    """
     missing = np.asarray(np.isnan(innovation))
     is_pair = ~missing[..., :, None] & ~missing[..., None, :]
     # Missing numbers have a zero innovation and a unit covariance, of which no log p depends.
@@ -312,17 +358,16 @@ def _condition_bank(
     return new_mean, new_cov, np.maximum(joint - total, _LEAST), total[..., 0]
 
 
-def _mix(weights: Array, means: Array, covs: Array) -> tuple[Array, Array]:
+def _mix(weights: Array, means: Array, covs: Array) -> _Moments:
     """Return moments of mixtures: Σ w m, and Σ w (P + (m - m̄)(m - m̄)ᵀ)."""
     mean = (weights[..., None, :] @ means)[..., 0, :]
     anomalies = means - mean[..., None, :]
     spread = (weights[..., None, :] * anomalies.mT) @ anomalies
-    return mean, (weights[..., None, None] * covs).sum(axis=-3) + spread
+    within = (weights[..., None, None] * covs).sum(axis=-3)
+    return _Moments(mean, within + spread)
 
 
-def _predict_moments(
-    predicted: Array, weights: Array, covs: Array
-) -> tuple[Array, Array]:
+def _predict_moments(predicted: Array, weights: Array, covs: Array) -> _Moments:
     """Return moments of the predictions of the components that can see; NaN if none can."""
     predicted, weights = select_visible(predicted, weights)
     return _mix(weights, predicted, covs)

@@ -10,9 +10,9 @@ import numpy as np
 
 from ..linalg import symmetrise
 from ..network import Graph, fuse_on_tree
-from ..validation import Array, Rng, check_positive_definite
+from ..validation import Array, Rng
 from .gaussian import GaussianFamily, GaussianState
-from .priors import Prior
+from .priors import Prior, moments_by_agent
 from .resets import Reset, reset_gaussian
 from .states import State
 from .step import Step
@@ -110,7 +110,7 @@ class ChannelFilter(GaussianFamily):
                 "prior must be one for all agents, of which the links begin, got a list"
             )
         # A known constant has no information matrix.
-        check_positive_definite(covs, "prior")
+        moments_by_agent(prior, self.model.dim, self.n_agents, "definite")
         # Both ends of each link begin with the common prior.
         n_links = self.graph.senders.size
         fields["link_means"] = np.repeat(means[..., :1, :], n_links, axis=-2)
@@ -140,14 +140,14 @@ class ChannelFilter(GaussianFamily):
         together.state = self._join_links(step.state)
         all_means, all_covs = self._forecast(together)
         unit = np.eye(self.model.dim)
-        means = step.check_forecast(all_means[..., :n, :], 0.0)
-        covs = step.check_forecast(all_covs[..., :n, :, :], unit)
+        means = step.check_forecast(all_means[..., :n, :], old=0.0)
+        covs = step.check_forecast(all_covs[..., :n, :, :], old=unit)
         for place, group in step.received():
             means, covs = self._condition(means, covs, place, group, step)
         # A run that has failed gets harmless Gaussians, so that the batch can go on.
-        covs = step.keep_failed(covs, unit)
-        link_means = step.keep_failed(all_means[..., n:, :], 0.0)
-        link_covs = step.keep_failed(all_covs[..., n:, :, :], unit)
+        covs = step.keep_failed(covs, old=unit)
+        link_means = step.keep_failed(all_means[..., n:, :], old=0.0)
+        link_covs = step.keep_failed(all_covs[..., n:, :, :], old=unit)
         if step.channel is not None:
             # Y_i + Σ (Y_j - Y_ij), and the links' new common beliefs
             belief, common = fuse_on_tree(
@@ -176,7 +176,7 @@ class ChannelFilter(GaussianFamily):
         return GaussianState.construct(
             state.t,
             state.ledger,
-            None,
+            rng=None,
             joint_means=means,
             joint_covariances=covs,
             dim=state.dim,

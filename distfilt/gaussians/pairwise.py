@@ -10,7 +10,7 @@ covariances are diagonal: with :math:`\mathbf P_a=\mathbf L\mathbf L^\top` and
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
@@ -97,9 +97,10 @@ def intersect_inverses(
     (array([0.6]), array([[1.2]]))
     """
     # P_a = T Tᵀ, P_b = T D Tᵀ and z = T⁻¹ (m_b - m_a)
-    transform, d, z = _diagonalise(mean_a, cov_a, mean_b, cov_b)
+    common = _diagonalise(mean_a, cov_a, mean_b, cov_b)
+    d = common.variances_b
     # tr T diag(p) Tᵀ = Σ_k p_k |t_k|² with the columns t_k
-    scale = (transform**2).sum(axis=-2)
+    scale = (common.transform**2).sum(axis=-2)
 
     def variances(weight: Array) -> Array:
         """Return the variances in the common coordinates, (..., d), for weights (...)."""
@@ -120,7 +121,7 @@ def intersect_inverses(
     w = weight[..., None]
     # The gain of b: P (P_b⁻¹ - (1 - ω) (ω P_a + (1 - ω) P_b)⁻¹)
     gain = p * (1 / d - (1 - w) / (w + (1 - w) * d))
-    return _transform_back(transform, mean_a, gain * z, p)
+    return _transform_back(common.transform, mean_a, gain * common.difference, p)
 
 
 @validated
@@ -157,11 +158,13 @@ def intersect_ellipsoids(
            [0., 3.]]))
     """
     # P_a = T Tᵀ, P_b = T D Tᵀ and z = T⁻¹ (m_b - m_a)
-    transform, d, z = _diagonalise(mean_a, cov_a, mean_b, cov_b)
+    common = _diagonalise(mean_a, cov_a, mean_b, cov_b)
+    d = common.variances_b
     # The limit of the paper's (16) for η to zero: all weight is on the smaller variance, so that
     # the gain of b is 1 where D < I, and 0 where D > I.
     gain = np.where(np.abs(d - 1) < _TIE, 0.5, (d < 1).astype(np.float64))
-    return _transform_back(transform, mean_a, gain * z, np.minimum(1.0, d))
+    shift = gain * common.difference
+    return _transform_back(common.transform, mean_a, shift, np.minimum(1.0, d))
 
 
 @validated
@@ -315,9 +318,10 @@ def unite_gaussians(
         first = cov_a + w**2 * square
         second = cov_b + (1 - w) ** 2 * square
         # In the coordinates common to both they are I and D. Means do not matter here.
-        transform, d, _ = _diagonalise(difference, first, difference, second)
+        common = _diagonalise(difference, first, difference, second)
         # P = T max(I, D) Tᵀ
-        return np.asarray(transform * np.sqrt(np.maximum(1.0, d))[..., None, :])
+        std = np.sqrt(np.maximum(1.0, common.variances_b))
+        return np.asarray(common.transform * std[..., None, :])
 
     def size(weights: Array) -> Array:
         """Return tr P or half of log det P, (..., points), for weights (..., points)."""
@@ -325,7 +329,7 @@ def unite_gaussians(
         if rule == "min_trace":
             # tr F Fᵀ = |F|²
             return np.asarray((factors**2).sum(axis=(-2, -1)))
-        return np.asarray(np.linalg.slogdet(factors)[1])
+        return np.asarray(np.linalg.slogdet(factors).logabsdet)
 
     weight = _choose_weight(omega, size, leading)
     factor = cover(weight)
@@ -341,14 +345,21 @@ def _broadcast_pair(
     return broadcast_leading(leading, cov_b.shape[:-2], "cov_b")
 
 
+class _CommonCoordinates(NamedTuple):
+    """Coordinates in which two covariances are diagonal: P_a = T Tᵀ and P_b = T D Tᵀ.
+
+    T is (..., d, d); the diagonal of D and the difference z = T⁻¹ (m_b - m_a) are (..., d).
+    """
+
+    transform: Array
+    variances_b: Array
+    difference: Array
+
+
 def _diagonalise(
     mean_a: Array, cov_a: Array, mean_b: Array, cov_b: Array
-) -> tuple[Array, Array, Array]:
-    """Return T, the diagonal of D and z = T⁻¹ (m_b - m_a) of the coordinates common to both.
-
-    In them both covariances are diagonal: P_a = T Tᵀ and P_b = T D Tᵀ. The results have shapes
-    (..., d, d), (..., d) and (..., d) with the same leading axes.
-    """
+) -> _CommonCoordinates:
+    """Return the coordinates in which both covariances are diagonal, that of a the identity."""
     leading = _broadcast_pair(mean_a, cov_a, mean_b, cov_b)
     size = cov_a.shape[-1]
     lower = np.broadcast_to(cholesky(cov_a), (*leading, size, size))
@@ -358,7 +369,7 @@ def _diagonalise(
     d, axes = np.linalg.eigh(symmetrise(white))
     difference = np.broadcast_to(mean_b - mean_a, (*leading, size))
     z = axes.mT @ solve_lower(lower, difference[..., None])
-    return lower @ axes, d, z[..., 0]
+    return _CommonCoordinates(lower @ axes, variances_b=d, difference=z[..., 0])
 
 
 def _transform_back(

@@ -205,14 +205,14 @@ def unscented_points(
     offsets = math.sqrt(d + kappa) * root.mT
     zero = 0 * offsets[..., :1, :]
     offsets = np.concatenate([zero, offsets, -offsets], axis=-2)
-    return mean[..., None, :] + offsets, unscented_weights(d, kappa).copy()
+    return mean[..., None, :] + offsets, make_unscented_weights(d, kappa).copy()
 
 
 @lru_cache(maxsize=16)
-def unscented_weights(d: int, kappa: float) -> Array:
+def make_unscented_weights(d: int, kappa: float) -> Array:
     """Weights of the 2d + 1 points, read-only and made once.
 
-    >>> unscented_weights(1, 2.0).round(3).tolist()
+    >>> make_unscented_weights(1, 2.0).round(3).tolist()
     [0.667, 0.167, 0.167]
     """
     weights = np.full(2 * d + 1, 0.5 / (d + kappa))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -15,10 +16,10 @@ from ..linalg import (
     log_det,
     solve_lower,
     solve_semidefinite,
-    solve_upper,
     symmetrise,
 )
 from ..sensors import Sensor
+from ..sensors.base import count_turns
 from ..validation import (
     ALLOW_NAN,
     Array,
@@ -127,7 +128,10 @@ def kalman_filter(
     >>> run.means.ravel().round(4)
     array([0.7143, 0.7143, 1.5263])
     """
-    runs, y, x, p = flatten_runs(mean, cov, observations)
+    flat = flatten_runs(mean, cov, observations)
+    y = flat.observations
+    x = flat.means
+    p = flat.covs
     f, h, q, r = repeat_per_step(len(y), F=F, H=H, Q=Q, R=R)
     # A contiguous copy is faster in the loop.
     f_transposed = np.ascontiguousarray(f.mT)
@@ -153,17 +157,17 @@ def kalman_filter(
         innovations = y[k] - h[k] @ x
         innovations[missing[k]] = 0.0
         # Analysis: x = x⁻ + K (y - H x⁻), P in Joseph's form
-        increment, p, log_likelihood[k] = assimilate(
+        increments, p, log_likelihood[k] = assimilate(
             p, innovations, h[k], r[k], missing[k]
         )
-        x = x + increment
+        x = x + increments
         means[k] = x
         covs[k] = p
     if not np.isfinite(means).all():
         raise np.linalg.LinAlgError(
             "kalman_filter: a mean overflowed; rescale F, H, Q or R"
         )
-    return unflatten_runs(means.mT, covs, log_likelihood, runs)
+    return unflatten_runs(means.mT, covs, log_likelihood, flat.runs)
 
 
 def _share_covariance(cov: Array, y: Array) -> bool:
@@ -195,7 +199,7 @@ def assimilate(
         Analysis means minus forecast means.
     cov : ndarray, (..., d, d)
         The analysis covariance.
-    log_density : ndarray, (..., k)
+    log_densities : ndarray, (..., k)
         Logarithms of the innovations' densities.
     """
     # H P and S = H P Hᵀ + R, with a one on the diagonal for missing components
@@ -210,12 +214,12 @@ def assimilate(
     # With S = L Lᵀ: L⁻¹ [H P, e] in one solve
     whitened = solve_lower(lower, np.concatenate([cross, innovations], axis=-1))
     # K = P Hᵀ S⁻¹ = (L⁻ᵀ L⁻¹ H P)ᵀ
-    gain = solve_upper(lower, whitened[..., :d]).mT
+    gain = solve_lower(lower, whitened[..., :d], transposed=True).mT
     # log N(e; 0, S) = -½ (|L⁻¹ e|² + m log 2π + log det S), m without missing components
     squares = (whitened[..., d:] ** 2).sum(axis=-2)
     constant = np.log(2 * np.pi) * (~missing).sum(axis=-1) + log_det(lower)
-    log_density = -0.5 * (squares + constant[..., None])
-    return gain @ innovations, joseph(cov, gain, H, R), log_density
+    log_densities = -0.5 * (squares + constant[..., None])
+    return gain @ innovations, joseph(cov, gain, H, R), log_densities
 
 
 @validated
@@ -283,14 +287,23 @@ def rts_smoother(
     return run.replace(means=means, covariances=covs)
 
 
-def flatten_runs(
-    mean: Array, cov: Array, observations: Array
-) -> tuple[tuple[int, ...], Array, Array, Array]:
+class FlatRuns(NamedTuple):
+    """Arguments whose run axes, of the shape `runs`, are flattened to one of length R.
+
+    Observations are (T, R, m), means (R, d) and covariances (R, d, d).
+    """
+
+    runs: tuple[int, ...]
+    observations: Array
+    means: Array
+    covs: Array
+
+
+def flatten_runs(mean: Array, cov: Array, observations: Array) -> FlatRuns:
     """Broadcast the run axes of three arguments, and flatten them to one axis of length R.
 
     The axes are the leading ones of the mean (..., d) and of the covariance (..., d, d), and the
-    middle ones of the observations (T, ..., m). Returns the axes, observations (T, R, m), means
-    (R, d) and covariances (R, d, d).
+    middle ones of the observations (T, ..., m).
     """
     runs = broadcast_leading(observations.shape[1:-1], mean.shape[:-1], "mean")
     runs = broadcast_leading(runs, cov.shape[:-2], "cov")
@@ -304,7 +317,7 @@ def flatten_runs(
     y = np.broadcast_to(y, (steps, *runs, m)).reshape(steps, size, m)
     x = np.broadcast_to(mean, (*runs, d)).reshape(size, d)
     p = np.broadcast_to(cov, (*runs, *cov.shape[-2:])).reshape(size, *cov.shape[-2:])
-    return runs, y, x, p
+    return FlatRuns(runs, observations=y, means=x, covs=p)
 
 
 def unflatten_runs(
@@ -354,5 +367,14 @@ def prepend_prior_time(times: Array, observations: Array, sensor: Sensor) -> Arr
         )
     if times.min(initial=np.inf) <= 0:
         raise ValueError(f"times must be after 0, got {format_number(times[0])}")
-    warn_of_clock(0.0, times, "times")
+    warn_of_clock(start=0.0, times=times, name="times")
+    if sensor.wraps and observations.size:
+        turns = count_turns(sensor, np.nan_to_num(observations.reshape(-1, sensor.dim)))
+        if turns > 4:
+            warnings.warn(
+                f"observations must be angles in rad, got some {turns:.0f} turns off: are "
+                "they in degrees?",
+                RuntimeWarning,
+                stacklevel=4,
+            )
     return np.concatenate([[0.0], times])

@@ -230,14 +230,18 @@ def mekf(
             # Observed, but not predicted.
             has_unseen |= bool((np.isnan(innovation) & ~np.isnan(y[n])).any())
             slope = _error_jacobian(forecast, joint, previous, parts, chart)
-            x, previous, p, log_likelihood[n] = _assimilate(
+            analysis = _assimilate(
                 forecast, joint, previous, innovation, slope, chart, sensor
             )
         except np.linalg.LinAlgError as error:
             raise np.linalg.LinAlgError(f"at t = {format_number(t)}: {error}") from None
+        x = analysis.means
         means[n] = x
-        covs[n] = p[:, :k, :k]
-        previous, p = _replace_previous(x, previous, p, y[n], increments)
+        covs[n] = analysis.joint_covs[:, :k, :k]
+        log_likelihood[n] = analysis.log_densities
+        previous, p = _replace_previous(
+            x, analysis.previous, analysis.joint_covs, y[n], increments
+        )
     if has_unseen:
         warnings.warn(
             "observations must be predicted to be used, but a sensor cannot see from a mean "
@@ -333,6 +337,19 @@ def _find_innovation(
     return sensor.residual(y, np.concatenate(predicted, axis=-1))
 
 
+class _JointAnalysis(NamedTuple):
+    """Analysis of the present and of the earlier states, in R runs.
+
+    Means (R, d), those of the earlier states with which sensors of increments compare, covariances
+    (R, K, K) of the errors of all these, and logarithms of the innovations' densities, (R,).
+    """
+
+    means: Array
+    previous: list[Array]
+    joint_covs: Array
+    log_densities: Array
+
+
 def _assimilate(
     forecast: Array,
     cov: Array,
@@ -341,8 +358,8 @@ def _assimilate(
     slope: Array,
     chart: QuaternionChart,
     sensor: Sensor,
-) -> tuple[Array, list[Array], Array, Array]:
-    """Return analysis means (R, d), earlier means, covariances (R, K, K) and log densities (R,).
+) -> _JointAnalysis:
+    """Update the present and the earlier states by an observation.
 
     `innovation` (R, m) is NaN where a component is missing; `slope` (R, m, K) is its derivative in
     the present and the earlier errors, of which `cov` (R, K, K) is the covariance.
@@ -351,17 +368,19 @@ def _assimilate(
     # Missing components have no innovation and no row in H.
     innovation = np.where(missing, 0.0, innovation)
     h = np.where(missing[..., None], 0.0, slope)
-    error, cov, log_density = assimilate(
+    changes, cov, log_densities = assimilate(
         cov, innovation[..., None], h, sensor.noise_cov, missing
     )
+    # Every run has a covariance of its own, so that there is one column.
+    error = changes[..., 0]
     k = chart.error_dim
-    x = chart.retract(forecast, error[:, :k, 0])
+    x = chart.retract(forecast, error[:, :k])
     _check_finite(x)
     smoothed = []
     for j, mean in enumerate(previous, start=1):
         # The observation tells of the earlier states too: their errors are block j.
-        smoothed.append(chart.retract(mean, error[:, j * k : (j + 1) * k, 0]))
-    return x, smoothed, cov, log_density[:, 0]
+        smoothed.append(chart.retract(mean, error[:, j * k : (j + 1) * k]))
+    return _JointAnalysis(x, smoothed, cov, log_densities[:, 0])
 
 
 def _replace_previous(

@@ -27,6 +27,7 @@ from ..validation import (
     PositiveDefinite,
     PositiveSemidefinite,
     Times,
+    format_number,
     import_optional,
     validated,
 )
@@ -172,7 +173,9 @@ def filterpy_ekf(
         if present.any():
             # filterpy subtracts the prediction from the observation. Angles have to be wrapped, so
             # it gets the sensor's residual for an observation, and zero for its prediction.
-            residual = sensor.residual(z, sensor.predict(forecast))[present]
+            predicted = sensor.predict(forecast)
+            _check_seen(predicted[present], t + dt)
+            residual = sensor.residual(z, predicted)[present]
             h = sensor.jacobian(forecast, std=deviations(kf.P))[present]
             noise_cov = sensor.noise_cov[np.ix_(present, present)]
             kf.update(residual, lambda x: h, lambda x: 0 * residual, noise_cov)
@@ -221,9 +224,11 @@ def filterpy_ukf(
 
     def make() -> _Filterpy:
         # α = 1, β = 0, κ = 1: the weights of all points are positive.
-        points = filterpy.MerweScaledSigmaPoints(model.dim, 1.0, 0.0, 1.0)
+        points = filterpy.MerweScaledSigmaPoints(
+            model.dim, alpha=1.0, beta=0.0, kappa=1.0
+        )
         kf: _Filterpy = filterpy.UnscentedKalmanFilter(
-            model.dim, sensor.dim, 0.0, None, None, points
+            model.dim, sensor.dim, dt=0.0, hx=None, fx=None, points=points
         )
         return kf
 
@@ -242,11 +247,21 @@ def filterpy_ukf(
             # filterpy averages and subtracts plainly: angles are put on one branch for it. Its
             # sigmas_f are the points of the forecast, and Wm their weights.
             predicted, observed = _unwrap(sensor, kf.sigmas_f, kf.Wm, z)
+            _check_seen(predicted[:, present], t + dt)
             rows = iter(predicted[:, present])
             noise_cov = sensor.noise_cov[np.ix_(present, present)]
             kf.update(observed[present], R=noise_cov, hx=lambda x: next(rows))
 
     return _run_filterpy(mean, cov, observations, make, step)
+
+
+def _check_seen(predicted: Array, t: float) -> None:
+    """Refuse predictions that do not exist, which filterpy cannot leave out."""
+    if np.isnan(predicted).any():
+        raise ValueError(
+            "observations must be predicted to be used by filterpy, but a sensor cannot see at "
+            f"t = {format_number(t)} s: mark them as missing (NaN), or use a GaussianFilter"
+        )
 
 
 def _unwrap(
@@ -290,7 +305,10 @@ def _run_filterpy(
     `make` returns a new filter, and `step` moves it by one observation time.
     """
     # Runs one after the other: filterpy has no batches.
-    runs, y, x, p = flatten_runs(mean, cov, observations)
+    flat = flatten_runs(mean, cov, observations)
+    y = flat.observations
+    x = flat.means
+    p = flat.covs
     means = np.empty((len(y), *x.shape))
     covs = np.empty((len(y), *p.shape))
     log_likelihood = np.zeros(y.shape[:2])
@@ -309,4 +327,4 @@ def _run_filterpy(
                 log_likelihood[k, run] = kf.log_likelihood
     if not np.isfinite(means).all():
         raise np.linalg.LinAlgError("filterpy's filter: a mean is no longer finite")
-    return unflatten_runs(means, covs, log_likelihood, runs)
+    return unflatten_runs(means, covs, log_likelihood, flat.runs)

@@ -8,6 +8,7 @@ Filters call these functions, with models and sensors that have been checked.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,15 +47,15 @@ def propagate_mixture(
     (array([[1.25]]), array([[[1.125]]]))
     """
     values = np.asarray(call_user(function, _place_points(mixture)))
-    means, first, second = _take_differences(values)
-    is_finite = [np.isfinite(part).all() for part in (means, first, second)]
+    differences = _take_differences(values)
+    is_finite = [np.isfinite(part).all() for part in differences]
     if not all(is_finite):
         raise ValueError(
             "function must return finite values at the points, got NaN or an overflow"
         )
     # P = C Cᵀ + Q with the columns C = [first, second].
-    factors = _combine_roots(first, second, noise_factor)
-    return _build_from_factors(mixture.weights, means, factors)
+    factors = _combine_roots(differences.first, differences.second, noise_factor)
+    return _build_from_factors(mixture.weights, differences.mean, factors)
 
 
 def update_mixture(
@@ -99,21 +100,23 @@ def update_mixture(
     """
     if np.isnan(observed).all():
         return mixture
-    innovations, first, second, noise_factor = _innovations(
+    innovation = _find_innovations(
         mixture, observed, function, noise, residual, on_branch
     )
-    # S = C Cᵀ with the columns C = [first, second, noise], as a triangular root.
-    root = _combine_roots(first, second, noise_factor)
+    first = innovation.first
+    second = innovation.second
+    noise_factor = innovation.noise_factor
+    root = innovation.root()
     # K = P_xy S⁻¹ by two triangular solves, with P_xy = L firstᵀ.
     cross = mixture.factors @ first.mT
     gain = np.linalg.solve(root.mT, np.linalg.solve(root, cross.mT)).mT
-    means = mixture.means + (gain @ innovations[..., None])[..., 0]
+    means = mixture.means + (gain @ innovation.values[..., None])[..., 0]
     # P⁺ = (L - K first)(…)ᵀ + (K second)(…)ᵀ + (K noise)(…)ᵀ, a sum of squares.
     factors = _combine_roots(
         mixture.factors - gain @ first, gain @ second, gain @ noise_factor
     )
     # Weights by the likelihood N(innovation; 0, S).
-    squared_lengths = quadratic_form(root, innovations)
+    squared_lengths = quadratic_form(root, innovation.values)
     logs = -0.5 * (squared_lengths + log_det(root) + len(noise_factor) * _LOG_2PI)
     logs = np.where(np.isfinite(logs), mixture.log_weights + logs, -np.inf)
     if not np.isfinite(logs.max()):
@@ -156,11 +159,10 @@ def within_gate(
     ... ]
     [array([nan]), array([9.5])]
     """
-    innovations, first, second, noise_factor = _innovations(
+    innovation = _find_innovations(
         mixture, observed, function, noise, residual, on_branch
     )
-    root = _combine_roots(first, second, noise_factor)
-    squared_distances = quadratic_form(root, innovations)
+    squared_distances = quadratic_form(innovation.root(), innovation.values)
     squared_distances = np.where(mixture.weights > 0, squared_distances, np.nan)
     # Distances are NaN for components that predict nothing.
     predicts = np.isfinite(squared_distances).any()
@@ -169,28 +171,34 @@ def within_gate(
     return observed
 
 
-def _innovations(
+class _Innovations(NamedTuple):
+    """Innovations (L, k) of the k observed components, and the parts of their covariances.
+
+    Divided differences of the predictions, (L, k, d), and the Cholesky factor (k, k) of the noise
+    covariance.
+    """
+
+    values: Array
+    first: Array
+    second: Array
+    noise_factor: Array
+
+    def root(self) -> Array:
+        """Return a triangular root of S = C Cᵀ with the columns C = [first, second, noise]."""
+        return _combine_roots(self.first, self.second, self.noise_factor)
+
+
+def _find_innovations(
     mixture: GaussianMixture,
     observed: Array,
     function: Callable[[Array], Array],
     noise: Array,
     residual: Callable[[Array, Array], Array],
     on_branch: bool,
-) -> tuple[Array, Array, Array, Array]:
-    """Innovations of the k observed components, and roots of their covariances.
+) -> _Innovations:
+    """Compare the observed components with their predictions by each component of the mixture.
 
-    Parameters
-    ----------
-    mixture, observed, function, noise, residual, on_branch
-        As of :func:`update_mixture`.
-
-    Returns
-    -------
-    innovations : ndarray, (L, k)
-    first, second : ndarray, (L, k, d)
-        Divided differences of the predictions.
-    noise_factor : ndarray, (k, k)
-        Cholesky factor of the noise covariance.
+    The arguments are those of :func:`update_mixture`.
     """
     missing = np.isnan(observed)
     present = np.flatnonzero(~missing)
@@ -203,24 +211,39 @@ def _innovations(
     at_means = np.broadcast_to(at_mean[:, None], predicted.shape)
     compare = np.subtract if on_branch else residual
     relative = call_user(compare, predicted, at_means)[..., present]
-    mean, first, second = _take_differences(relative)
+    spread = _take_differences(relative)
     difference = call_user(residual, np.broadcast_to(y, at_mean.shape), at_mean)
-    innovations = difference[..., present] - mean
-    return innovations, first, second, cholesky(noise[np.ix_(present, present)])
+    return _Innovations(
+        difference[..., present] - spread.mean,
+        spread.first,
+        spread.second,
+        noise_factor=cholesky(noise[np.ix_(present, present)]),
+    )
 
 
 def _place_points(mixture: GaussianMixture) -> Array:
     """Points (L, 2d + 1, d) at distance √3 standard deviations from the means."""
     # √(d + κ) is the distance.
     kappa = _SQUARED_STEP - mixture.dim
-    return unscented_points(mixture.means, mixture.factors, kappa=kappa)[0]
+    points, _weights = unscented_points(mixture.means, mixture.factors, kappa=kappa)
+    return points
 
 
-def _take_differences(values: Array) -> tuple[Array, Array, Array]:
-    """Mean (..., m) of a function's values (..., 2d + 1, m), and first and second differences.
+class _DividedDifferences(NamedTuple):
+    """Mean (..., m) of a function's values, and divided differences of first and second order.
 
-    The values are those at :func:`_place_points`. The differences (..., m, d) are columns of a
-    root of the values' covariance.
+    The differences (..., m, d) are columns of a root of the values' covariance.
+    """
+
+    mean: Array
+    first: Array
+    second: Array
+
+
+def _take_differences(values: Array) -> _DividedDifferences:
+    """Return the divided differences of a function's values (..., 2d + 1, m).
+
+    The values are those at :func:`_place_points`.
     """
     d = values.shape[-2] // 2
     centre = values[..., :1, :]
@@ -232,7 +255,7 @@ def _take_differences(values: Array) -> tuple[Array, Array, Array]:
     # first = (f₊ - f₋) / (2 h) and second = (f₊ + f₋ - 2 f₀) √(h² - 1) / (2 h²)
     first = (plus - minus).mT / (2 * np.sqrt(_SQUARED_STEP))
     second = even.mT * np.sqrt(_SQUARED_STEP - 1) / (2 * _SQUARED_STEP)
-    return mean, first, second
+    return _DividedDifferences(mean, first, second)
 
 
 def _combine_roots(first: Array, second: Array, noise: Array) -> Array:

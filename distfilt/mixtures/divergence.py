@@ -113,7 +113,7 @@ def jeffreys_of_many(
     # f; density 0 is p.
     expectations = integrals / masses[:, None]
     divergences = 0.5 * (expectations[0, 1:] - np.diagonal(expectations)[1:])
-    return [Divergence(float(d), 0.0) for d in divergences]
+    return [Divergence(float(d), error=0.0) for d in divergences]
 
 
 def _evaluate_all(functions: Sequence[Callable[[Array], Array]], x: Array) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,6 +35,19 @@ __all__ = ["GaussianMixture"]
 _LOG_2PI = float(np.log(2 * np.pi))
 # Numbers in one block of an evaluation: half a megabyte stays in the cache.
 _BLOCK_SIZE = 60_000
+
+
+class _WhiteFrame(NamedTuple):
+    """A mixture's mean c (d,), and the matrices and means that whiten points.
+
+    With the Cholesky factors C_l of the L components these are C_l⁻ᵀ side by side, (d, L d), and
+    C_l⁻¹ (m_l - c), (L, d). Points and means are relative to c: far from the origin their
+    differences would lose digits.
+    """
+
+    centre: Array
+    columns: Array
+    means: Array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -188,34 +201,29 @@ class GaussianMixture(FrozenModel):
         It is called with blocks of n points, (n, L), and returns (n, *shape).
         """
         points = x.reshape(-1, self.dim)
-        centre, whitening, white_means = self._whitening
+        frame = self._white_frame
         result = np.empty((len(points), *shape))
         block = max(1, _BLOCK_SIZE // self.means.size)
         for start in range(0, len(points), block):
             rows = slice(start, start + block)
             # z = C_l⁻¹ (x - c) - C_l⁻¹ (m_l - c) for each component l, with the factors C_l and
             # the centre c: one product for all components. Then log N_l = log peak_l - ½ zᵀz.
-            white = (points[rows] - centre) @ whitening
-            z = white.reshape(-1, *white_means.shape) - white_means
+            white = (points[rows] - frame.centre) @ frame.columns
+            z = white.reshape(-1, *frame.means.shape) - frame.means
             squared_lengths = np.einsum("nld,nld->nl", z, z)
             result[rows] = function(self.log_peaks - 0.5 * squared_lengths)
         return result.reshape((*x.shape[:-1], *shape))
 
     @cached_property
-    def _whitening(self) -> tuple[Array, Array, Array]:
-        """The mixture's mean c (d,), and the matrices and means that whiten points.
-
-        With the Cholesky factors C_l of the L components these are C_l⁻ᵀ side by side, (d, L d),
-        and C_l⁻¹ (m_l - c), (L, d). Points and means are relative to c: far from the origin their
-        differences would lose digits.
-        """
+    def _white_frame(self) -> _WhiteFrame:
+        """The coordinates in which each component is a standard normal."""
         centre = self.weights @ self.means
         identity = np.broadcast_to(np.eye(self.dim), self.covs.shape)
         inverse_factors = np.linalg.solve(self.factors, identity)
         differences = self.means - centre
         white_means = (inverse_factors @ differences[..., None])[..., 0]
         columns = np.array(inverse_factors.reshape(-1, self.dim).T)
-        return centre, columns, white_means
+        return _WhiteFrame(centre, columns, white_means)
 
     @validated
     def marginal(self, indices: DistinctIndices) -> GaussianMixture:
@@ -314,7 +322,7 @@ class GaussianMixture(FrozenModel):
 
 def _describe_collapse(covs: Array) -> str:
     """Name the component whose covariance (L, d, d) has no Cholesky factor, and the usual cause."""
-    eigenvalues = np.linalg.eigvalsh(to_unit_variances(covs)[0])
+    eigenvalues = np.linalg.eigvalsh(to_unit_variances(covs).correlation)
     worst = int(eigenvalues[:, 0].argmin())
     return (
         f"component {worst} of {len(covs)} has a covariance that is not positive definite "

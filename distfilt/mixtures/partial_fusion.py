@@ -294,7 +294,7 @@ class PartialFusion(FrozenModel):
         """
         points = mixture.means
         if with_points:
-            sigma_points = unscented_points(mixture.means, mixture.factors)[0]
+            sigma_points, _weights = unscented_points(mixture.means, mixture.factors)
             points = sigma_points.reshape(-1, mixture.dim)
             logs = self.log_value(points)
         # Entry (i, s) is component s at point i, relative to its peak.
@@ -509,7 +509,7 @@ def nonnegative_least_squares(
         matrix = np.concatenate([matrix, alpha * np.eye(n_unknowns)])
         right = np.concatenate([right, np.zeros(n_unknowns)])
     try:
-        solution = nnls(matrix, right, maxiter=20 * n_unknowns)[0]
+        solution, _residual = nnls(matrix, right, maxiter=20 * n_unknowns)
     except RuntimeError as error:
         raise SolverError(
             f"nonnegative least squares: {error} ({n_unknowns} unknowns)"

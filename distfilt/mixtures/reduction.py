@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -165,12 +165,13 @@ def runnalls(
         mixture = _absorb_into_heaviest(mixture, heaviest)
     if mixture.n_components <= n_components:
         return mixture
-    weights, means, covs, root = _whiten(mixture)
-    remaining = merge_pairs(weights, means, covs, n_components)
+    white = _whiten(mixture)
+    remaining = merge_pairs(white.weights, white.means, white.covs, n_components)
     # Back from the whitened frame.
-    means = mixture.mean + means[remaining] @ root.T
-    covs = symmetrise(root @ covs[remaining] @ root.T)
-    weights = weights[remaining] / weights[remaining].sum()
+    root = white.root
+    means = mixture.mean + white.means[remaining] @ root.T
+    covs = symmetrise(root @ white.covs[remaining] @ root.T)
+    weights = white.weights[remaining] / white.weights[remaining].sum()
     return GaussianMixture.construct(weights, means, covs)
 
 
@@ -186,11 +187,13 @@ def merge_costs(mixture: GaussianMixture) -> Array:
     >>> merge_costs(two)[0, 1].round(6) == np.round(0.5 * np.log(2), 6)
     np.True_
     """
-    weights, means, covs, _ = _whiten(mixture)
-    log_dets = np.linalg.slogdet(covs)[1]
-    n = mixture.n_components
-    index = np.arange(n)
-    rows = [pair_costs(weights, means, covs, log_dets, i, index) for i in range(n)]
+    white = _whiten(mixture)
+    log_dets = np.linalg.slogdet(white.covs).logabsdet
+    index = np.arange(mixture.n_components)
+    rows = []
+    for i in range(mixture.n_components):
+        costs = pair_costs(white.weights, white.means, white.covs, log_dets, i, index)
+        rows.append(costs)
     return np.stack(rows)
 
 
@@ -262,7 +265,7 @@ def merge_irrelevant(
     # All irrelevant components get one label, the others one each; then labels 0, 1, 2, ...
     labels = np.arange(mixture.n_components)
     labels[irrelevant] = mixture.n_components
-    consecutive = np.unique(labels, return_inverse=True)[1]
+    _distinct, consecutive = np.unique(labels, return_inverse=True)
     return _merge_groups(mixture, consecutive)
 
 
@@ -297,7 +300,7 @@ def pivoted_qr(
     mixture = shapes.with_equal_weights()
     # Entry (i, s): component s at the mean of component i, relative to its peak.
     logs = mixture.component_log_densities(shapes.means) - mixture.log_peaks
-    order = qr(np.exp(logs), mode="r", pivoting=True)[1]
+    _upper, order = qr(np.exp(logs), mode="r", pivoting=True)
     # A merged component takes one of the places.
     n_selected = n_components - 1 if rest == "merge" else n_components
     is_selected = np.isin(np.arange(shapes.n_components), order[:n_selected])
@@ -345,30 +348,41 @@ def _absorb_into_heaviest(mixture: GaussianMixture, n_heaviest: int) -> Gaussian
     All costs are those before any merger.
     """
     # The costs are the same in coordinates in which all numbers are of the order of one.
-    weights, means, covs, _ = _whiten(mixture)
-    order = np.argsort(-weights, kind="stable")
+    white = _whiten(mixture)
+    order = np.argsort(-white.weights, kind="stable")
     heavy = order[:n_heaviest]
-    log_dets = np.linalg.slogdet(covs)[1]
-    labels = np.empty(weights.size, dtype=np.intp)
+    log_dets = np.linalg.slogdet(white.covs).logabsdet
+    labels = np.empty(order.size, dtype=np.intp)
     labels[heavy] = np.arange(n_heaviest)
     for i in order[n_heaviest:]:
-        costs = pair_costs(weights, means, covs, log_dets, i, heavy)
+        costs = pair_costs(white.weights, white.means, white.covs, log_dets, i, heavy)
         labels[i] = costs.argmin()
     return _merge_groups(mixture, labels)
 
 
-def _whiten(mixture: GaussianMixture) -> tuple[Array, Array, Array, Array]:
+class _WhitenedMixture(NamedTuple):
+    """A mixture's weights (L,), means (L, d) and covariances (L, d, d) in whitened coordinates.
+
+    `root` (d, d) leads back from them.
+    """
+
+    weights: Array
+    means: Array
+    covs: Array
+    root: Array
+
+
+def _whiten(mixture: GaussianMixture) -> _WhitenedMixture:
     """Copy a mixture to coordinates z = L⁻¹ (x - m), in which it has mean 0 and covariance I.
 
-    m and L Lᵀ are the moments of the whole mixture. Returns the weights (L,), means (L, d) and
-    covariances (L, d, d) there, and the root L (d, d). Runnalls' bounds are the same, since all
-    logarithms of determinants change by one constant; numbers are of the order of one.
+    m and L Lᵀ are the moments of the whole mixture; L is the root. Runnalls' bounds are the same,
+    since all logarithms of determinants change by one constant; numbers are of the order of one.
     """
     root = np.linalg.cholesky(mixture.cov)
     inverse_root = np.linalg.solve(root, np.eye(mixture.dim))
     means = (mixture.means - mixture.mean) @ inverse_root.T
     covs = symmetrise(inverse_root @ mixture.covs @ inverse_root.T)
-    return mixture.weights.copy(), means, covs, np.asarray(root)
+    return _WhitenedMixture(mixture.weights.copy(), means, covs, np.asarray(root))
 
 
 def pair_costs(
@@ -391,7 +405,7 @@ def pair_costs(
     spread = (a * (1 - a))[:, None, None] * differences[:, :, None]
     merged += spread * differences[:, None, :]
     # 2 B_ij = (w_i + w_j) log|P_ij| - w_i log|P_i| - w_j log|P_j|
-    separate = total * np.linalg.slogdet(merged)[1] - weights[i] * log_dets[i]
+    separate = total * np.linalg.slogdet(merged).logabsdet - weights[i] * log_dets[i]
     bound = 0.5 * (separate - weights[others] * log_dets[others])
     return np.asarray(np.where(others == i, 0.0, bound))
 

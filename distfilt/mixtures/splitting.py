@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -131,7 +131,7 @@ def split_gaussian(
     Examples
     --------
     >>> nine = split_gaussian([0.0, 1.0], [[1.0, 0.5], [0.5, 2.0]], parts=3)
-    >>> nine.n_components, nine.moments()[1].round(12).tolist()
+    >>> nine.n_components, nine.cov.round(12).tolist()
     (9, [[1.0, 0.5], [0.5, 2.0]])
     >>> split_gaussian([0.0, 1.0], np.eye(2), parts=5, axes=[1]).means[:, 0]
     array([0., 0., 0., 0., 0.])
@@ -145,15 +145,15 @@ def split_gaussian(
     root = np.empty((d, d))
     root[order] = cholesky(cov[np.ix_(order, order)])
     root = root[:, : first.size]
-    std, places, weights = _place_on_line(parts)
-    # Every combination of places along the axes, with the product of their weights.
+    line = _place_on_line(parts)
+    # Every combination of means along the axes, with the product of their weights.
     n_axes = first.size
-    grid = np.stack(np.meshgrid(*[places] * n_axes, indexing="ij"), axis=-1)
+    grid = np.stack(np.meshgrid(*[line.means] * n_axes, indexing="ij"), axis=-1)
     grid = grid.reshape(-1, n_axes)
-    factors = np.stack(np.meshgrid(*[weights] * n_axes, indexing="ij"), axis=-1)
+    factors = np.stack(np.meshgrid(*[line.weights] * n_axes, indexing="ij"), axis=-1)
     grid_weights = factors.reshape(-1, n_axes).prod(axis=1)
     # P - (1 - s²) A Aᵀ for the columns A: along them a component has the deviation s.
-    piece = symmetrise(cov - (1 - std**2) * root @ root.T)
+    piece = symmetrise(cov - (1 - line.std**2) * root @ root.T)
     return GaussianMixture.construct(
         grid_weights,
         mean + grid @ root.T,
@@ -161,11 +161,20 @@ def split_gaussian(
     )
 
 
-def _place_on_line(parts: int) -> tuple[float, Array, Array]:
-    """Return deviation, means (parts,) and weights (parts,) that approximate N(0, 1).
+class _NormalMixture(NamedTuple):
+    """A mixture that approximates N(0, 1): the deviation of all parts, means and weights."""
 
-    The mixture has mean 0 and variance 1; :func:`split_gaussian` has its formula.
+    std: float
+    means: Array
+    weights: Array
+
+
+def _place_on_line(parts: int) -> _NormalMixture:
+    """Return a mixture of so many equally wide Gaussians that approximates N(0, 1).
+
+    It has mean 0 and variance 1; :func:`split_gaussian` has its formula.
     """
+    # With few means a wider reach would leave gaps between them.
     reach = 2.5 if parts <= 8 else 3.0
     # The outermost of n means 1.5 s apart is at 0.75 s (n - 1). It shall be `reach` times the
     # deviation √(1 - s²) that is left to the means, which gives s; 0.75² = 0.5625.
@@ -180,7 +189,7 @@ def _place_on_line(parts: int) -> tuple[float, Array, Array]:
     weights /= weights.sum()
     # The variance of the places and of a component add up to 1.
     places *= np.sqrt((1 - std**2) / (weights @ places**2))
-    return std, places, weights
+    return _NormalMixture(std, places, weights)
 
 
 @validated
@@ -222,14 +231,14 @@ def nonlinearity(
     if scale is not None:
         jacobians = scale[:, None] * jacobians
     # G S = U Σ Vᵀ: the largest image of a unit vector v is that of v₁, of length σ₁.
-    _, singular_values, right = np.linalg.svd(jacobians @ factors)
-    first = right[:, 0]
+    svd = np.linalg.svd(jacobians @ factors)
+    first = svd.Vh[:, 0]
     # A singular vector's sign is arbitrary: its largest entry is made positive.
     largest = np.abs(first).argmax(axis=1)
     sign = np.sign(first[np.arange(len(first)), largest])
     first = sign[:, None] * first
     directions = (factors @ first[..., None])[..., 0]
-    return directions, singular_values[:, 0]
+    return directions, svd.S[:, 0]
 
 
 @validated
@@ -261,7 +270,7 @@ def split_components(
     --------
     >>> one = GaussianMixture.gaussian([0.0, 0.0], np.eye(2))
     >>> three = split_components(one, [0], [[1.0, 0.0]])
-    >>> three.n_components, three.moments()[1].round(12).tolist()
+    >>> three.n_components, three.cov.round(12).tolist()
     (3, [[1.0, 0.0], [0.0, 1.0]])
     """
     is_distinct = np.unique(which).size == which.size

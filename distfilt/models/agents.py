@@ -97,9 +97,10 @@ class AgentModels(Model):
                     f"{different[0]}"
                 )
         return cls(
-            first.dim,
-            _refuse_one_state,
-            _refuse_one_covariance,
+            dim=first.dim,
+            # There is no transition, and no covariance, of all agents: these raise an error.
+            transition=_refuse_one_state,
+            noise_cov=_refuse_one_covariance,
             names=first.names,
             units=first.units,
             periods=first.periods,
@@ -226,7 +227,7 @@ class _Team:
 
     def pieces(self, t: float, dt: float, ndim: int) -> list[Piece]:
         """Return the parts of a step, with inputs (A, ..., k) for states (A, ..., d)."""
-        n_agents, k, _ = self.input_covs.shape
+        n_agents, k = self.input_covs.shape[:2]
         return [
             (begin, length, _insert_axes(u.reshape(n_agents, k), ndim))
             for begin, length, u in self.inputs.pieces(t, dt)
@@ -252,8 +253,13 @@ def _read_team(models: Sequence[Model]) -> _Team | None:
             return None
     values = np.concatenate([one.values for one in inputs], axis=1)
     # The covariance of these joint inputs is never used: each agent has its own, returned beside.
-    side_by_side = Inputs(first.times, values, np.zeros((values.shape[1],) * 2))
-    return _Team(moves[0], side_by_side, np.stack([one.cov for one in inputs]))
+    n_values = values.shape[1]
+    side_by_side = Inputs(first.times, values, np.zeros((n_values, n_values)))
+    return _Team(
+        move=moves[0],
+        inputs=side_by_side,
+        input_covs=np.stack([one.cov for one in inputs]),
+    )
 
 
 def _insert_axes(values: Array, ndim: int) -> Array:

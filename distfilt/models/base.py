@@ -122,6 +122,8 @@ class Model(FrozenModel):
                 raise ValueError(
                     f"{name} must have {self.dim} entries, got {len(labels)}"
                 )
+        if len(set(self.names)) < len(self.names):
+            raise ValueError(f"names must be different, got {list(self.names)}")
 
     @validated
     def step(
@@ -447,7 +449,7 @@ def _transpose_transition(model: LinearModel, dt: float) -> Array:
 @lru_cache(maxsize=64)
 def _noise_of_step(model: LinearModel, dt: float) -> Array:
     """Return Q of a time-invariant model, made once for each dt."""
-    return model._compute_noise_cov(0.0, dt)
+    return model._compute_noise_cov(t=0.0, dt=dt)
 
 
 @validated

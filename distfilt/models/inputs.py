@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -26,6 +27,7 @@ from ..validation import (
     format_number,
     validated,
 )
+from ..validation.first_use import is_first_use
 from .base import Model
 
 __all__ = ["InputModel", "Inputs", "Piece", "add_up_noise", "move_by_inputs"]
@@ -41,7 +43,8 @@ class Inputs(FrozenModel):
     Parameters
     ----------
     times : array_like, (T,)
-        When each begins to hold, in s, increasing; the last one holds on.
+        When each begins to hold, in s, increasing; the last one holds on. A warning is given once
+        if it has to hold more than ten times as long as any other.
     values : array_like, (T, k)
     cov : array_like, (k, k)
         Covariance of the error of each, which holds as long as the input does; errors of different
@@ -63,6 +66,12 @@ class Inputs(FrozenModel):
         if not len(self.times):
             raise ValueError("times must have at least one entry, got none")
 
+    @cached_property
+    def _longest_use(self) -> float:
+        """Until when the last input may hold; one alone holds for ever."""
+        longest = np.diff(self.times).max(initial=0.0)
+        return float(self.times[-1] + 10 * longest) if longest else np.inf
+
     def pieces(self, t: float, dt: float) -> list[Piece]:
         """Return the parts of a step in which one input holds: (begin, length, input)."""
         if t < self.times[0]:
@@ -71,6 +80,13 @@ class Inputs(FrozenModel):
                 f"got {format_number(self.times[0])}"
             )
         end = t + dt
+        if end > self._longest_use and is_first_use(self, "end"):
+            warnings.warn(
+                f"times must reach a step's end at {format_number(end)}, got "
+                f"{format_number(self.times[-1])} last: the last input is held since then",
+                RuntimeWarning,
+                stacklevel=4,
+            )
         # A sum of steps may miss the time of an input by rounding. An input that begins within this
         # time of an end of the step begins at that end, so that no piece is that short.
         tolerance = 1e-9 * max(1.0, abs(t))

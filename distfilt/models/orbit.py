@@ -170,7 +170,8 @@ def propagate(
     h = dt / steps
     with np.errstate(all="ignore"):
         for _ in range(steps):
-            x = runge_kutta(_rate, x, 0.0, h) if rule == "rk4" else _dop853(x, h)
+            # The rate does not depend on the time.
+            x = runge_kutta(_rate, x, t=0.0, dt=h) if rule == "rk4" else _dop853(x, h)
             # Checked in each step: an orbit through the Earth may end outside it again.
             _check_outside(x[..., :3], "x")
     return np.asarray(x)

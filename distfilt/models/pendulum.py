@@ -73,7 +73,7 @@ def pendulum_rate(
     array([ 0. ,  0. , -0. ,  9.8])
     """
     # The rate does not depend on time.
-    return _rate(states, 0.0, length, gravity, form == "printed")
+    return _rate(states, t=0.0, length=length, g=gravity, printed=form == "printed")
 
 
 def _rate(states: Array, t: float, length: float, g: float, printed: bool) -> Array:

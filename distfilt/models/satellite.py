@@ -104,9 +104,9 @@ def clohessy_wiltshire(*, rate: PositiveFloat, sigma: NoiseStrength) -> LinearMo
     array([0.00401, 0.00401, 0.00401, 0.004  , 0.004  , 0.004  ])
     """
     return LinearModel.from_transition(
-        6,
-        partial(_transition_matrix, rate=rate),
-        partial(_noise, rate=rate, sigma=sigma),
+        dim=6,
+        transition_matrix=partial(_transition_matrix, rate=rate),
+        noise_cov=partial(_noise, rate=rate, sigma=sigma),
         names=("x", "y", "z", "vx", "vy", "vz"),
         units=("m", "m", "m", "m/s", "m/s", "m/s"),
     )
@@ -136,9 +136,9 @@ def satellite_pose(
     """
     translation = clohessy_wiltshire(rate=rate, sigma=sigma)
     return Model(
-        13,
-        partial(_pose_transition, rate=rate, step=step),
-        partial(_pose_noise, rate=rate, sigma=sigma),
+        dim=13,
+        transition=partial(_pose_transition, rate=rate, step=step),
+        noise_cov=partial(_pose_noise, rate=rate, sigma=sigma),
         names=translation.names + ("w1", "w2", "w3", "q1", "q2", "q3", "q4"),
         units=translation.units + ("rad/s",) * 3 + ("1",) * 4,
     )

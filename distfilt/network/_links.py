@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Sequence
 from numbers import Integral
-from typing import Protocol, TypeGuard
+from typing import Any, Protocol, TypeGuard
 
 import numpy as np
 import scipy
@@ -126,6 +126,8 @@ def order_nodes(
 
     >>> order_nodes([3, 1, 2], [])
     [1, 2, 3]
+    >>> order_nodes(["10", "9", "1"], [])  # as files have them
+    ['1', '9', '10']
     >>> order_nodes([3, 1, 2], ["a", "b", "c"])
     Traceback (most recent call last):
     ValueError: graph must have the nodes ['a', 'b', 'c'], got [3, 1, 2]
@@ -140,7 +142,7 @@ def order_nodes(
         if len(order) != len(nodes) or set(order) != labels or len(names) != len(nodes):
             raise ValueError(f"graph must have the nodes {list(names)}, got {nodes}")
         return order
-    # Integers, and tuples of integers, are sorted; other labels keep the graph's order.
+    # Integers, also as text, and tuples of them are sorted; others keep the graph's order.
     return sorted(nodes, key=_integers) if _are_integers(nodes) else nodes
 
 
@@ -150,15 +152,48 @@ def _are_integers(nodes: Sequence[Hashable]) -> bool:
     kinds = set()
     for node in nodes:
         entries = node if isinstance(node, tuple) else (node,)
-        if not all(isinstance(entry, Integral) for entry in entries):
+        if not all(_is_integer(entry) for entry in entries):
             return False
         kinds.add((type(node) is tuple, len(entries)))
     return len(kinds) <= 1
 
 
+def _is_integer(entry: object) -> bool:
+    """Whether a label, or a part of one, is an integer or text that is one."""
+    is_text = isinstance(entry, str) and entry.isascii() and entry.isdecimal()
+    return is_text or isinstance(entry, Integral)
+
+
+def number_edges(value: object, names: Sequence[str], name: str) -> object:
+    """Return edges between agents' names as edges between their numbers; others as they are.
+
+    >>> number_edges([("a", "c")], ["a", "b", "c"], "graph")
+    [(0, 2)]
+    >>> number_edges([("a", "d")], ["a", "b", "c"], "graph")
+    Traceback (most recent call last):
+    ValueError: graph must have edges between the agents ['a', 'b', 'c'], got 'd'
+    """
+    if not isinstance(value, list | tuple) or not value:
+        return value
+    for pair in value:
+        is_pair = isinstance(pair, list | tuple) and len(pair) == 2
+        if not is_pair or not all(isinstance(end, str) for end in pair):
+            return value
+    number_of = {label: number for number, label in enumerate(names)}
+    edges = []
+    for pair in value:
+        for end in pair:
+            if end not in number_of:
+                raise ValueError(
+                    f"{name} must have edges between the agents {list(names)}, got {end!r}"
+                )
+        edges.append((number_of[pair[0]], number_of[pair[1]]))
+    return edges
+
+
 def _integers(node: Hashable) -> tuple[int, ...]:
     """Return the integers of a label that is one, or a tuple of them."""
-    entries = node if isinstance(node, tuple) else (node,)
+    entries: tuple[Any, ...] = node if isinstance(node, tuple) else (node,)
     return tuple([int(entry) for entry in entries])
 
 

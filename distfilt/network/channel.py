@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, cast
 
@@ -64,24 +65,38 @@ F = TypeVar("F", bound=Callable[..., object])
 P = TypeVar("P", bound=Payload)
 
 
+class _Transmission(NamedTuple):
+    """The scalars and bytes of a radio transmission that reaches all receivers of an agent."""
+
+    scalars: int | Counts
+    bytes: int | Counts
+
+
 class _Size(NamedTuple):
     """The scalars and bytes of a round's messages: one number, or one for each link or agent.
 
-    `transmission` has the scalars and bytes of a radio transmission that reaches all receivers of
-    an agent at once; it is None if each message needs a transmission. With `is_common`, each
+    `transmission` is None if each message needs a transmission of its own. With `is_common`, each
     message on the agent's links is as large as the transmission.
     """
 
     scalars: int | Counts
     bytes: int | Counts
-    transmission: tuple[int | Counts, int | Counts] | None = None
+    transmission: _Transmission | None = None
     is_common: bool = False
 
     @classmethod
     def of_floats(cls, numbers: int) -> _Size:
         """Return the size of so many floats, the same for all receivers."""
-        transmission = numbers, 8 * numbers
+        transmission = _Transmission(numbers, 8 * numbers)
         return cls(numbers, 8 * numbers, transmission, is_common=True)
+
+
+@dataclass
+class _Queues:
+    """Messages on their way: the values of each round, and which of its messages arrive."""
+
+    values: deque[Array] = field(default_factory=deque)
+    arrivals: deque[Mask] = field(default_factory=deque)
 
 
 class Channel:
@@ -144,7 +159,7 @@ class Channel:
         # Number of rounds without faults that are not yet in the ledger, by message size.
         self._uncharged: dict[int, int] = {}
         # Messages on their way in a channel with a delay, by the shape of the values.
-        self._queues: dict[tuple[int, ...], tuple[deque[Array], deque[Mask]]] = {}
+        self._queues: dict[tuple[int, ...], _Queues] = {}
         self._perfect = self.faults.is_perfect
         if not self._perfect:
             self.faults.check_graph(self.graph)
@@ -215,7 +230,7 @@ class Channel:
         size = _Size(
             scalars[graph.senders],
             bytes_[graph.senders],
-            (scalars, bytes_),
+            _Transmission(scalars, bytes_),
             is_common=True,
         )
         used = sends[graph.senders]
@@ -268,10 +283,13 @@ class Channel:
         n_links = graph.senders.size
         copies, scalars, bytes_ = _count_payloads(payloads, n_links, self.runs)
         sent = cast(list[P | None], copies)
-        size = _Size(scalars, bytes_)
+        transmission = None
         if common is not None:
-            _, *of_agents = _count_payloads(common, graph.n_agents, self.runs)
-            size = _Size(scalars, bytes_, (of_agents[0], of_agents[1]))
+            _copies, agent_scalars, agent_bytes = _count_payloads(
+                common, graph.n_agents, self.runs
+            )
+            transmission = _Transmission(agent_scalars, agent_bytes)
+        size = _Size(scalars, bytes_, transmission)
         used = np.array([payload is not None for payload in sent], dtype=bool)
         arrived = self._transmit(used, size)
         result: list[P | None] = []
@@ -329,7 +347,7 @@ class Channel:
             return self._mix_without_faults(values, weights, rounds)
         after_rounds = self._mix_rounds(values, weights, on_loss, rounds)
         # The values after the last round
-        mixed, _ = deque(after_rounds, maxlen=1).pop()
+        mixed, _self_weights = deque(after_rounds, maxlen=1).pop()
         return mixed
 
     @validated
@@ -392,9 +410,9 @@ class Channel:
     ) -> tuple[Array, Array]:
         """Return the mixed values, and the weight that each own value got, (*runs, A)."""
         if self._perfect:
-            mixed = self._mix_without_faults(values, weights, 1)
+            mixed = self._mix_without_faults(values, weights, rounds=1)
             return mixed, weights.self_weights
-        return next(self._mix_rounds(values, weights, on_loss, 1))
+        return next(self._mix_rounds(values, weights, on_loss, rounds=1))
 
     def _mix_rounds(
         self, values: Array, weights: ConsensusWeights, on_loss: LossRule, rounds: int
@@ -479,7 +497,7 @@ class Channel:
 
     def _delay_values(self, values: Array) -> Array:
         """Return the values of some rounds ago; zeros, without a weight, before the first."""
-        queue, _ = self._queues.setdefault(values.shape, (deque(), deque()))
+        queue = self._queues.setdefault(values.shape, _Queues()).values
         queue.append(values.copy())
         if len(queue) > self.faults.total_delay:
             return queue.popleft()
@@ -487,7 +505,7 @@ class Channel:
 
     def _delay_arrivals(self, shape: tuple[int, ...], arrived: Mask) -> Mask:
         """Return for each round which messages of some rounds ago arrive, (rounds, R, E)."""
-        _, queue = self._queues.setdefault(shape, (deque(), deque()))
+        queue = self._queues.setdefault(shape, _Queues()).arrivals
         delayed = np.zeros_like(arrived)
         for k, links in enumerate(arrived):
             queue.append(links)
@@ -522,7 +540,9 @@ class Channel:
                 f"got one of {self.faults.total_delay} rounds"
             )
         if not self._perfect:
-            arrived = self._transmit_rounds(1, used, size, acknowledged=acknowledged)
+            arrived = self._transmit_rounds(
+                count=1, used=used, size=size, acknowledged=acknowledged
+            )
             return np.asarray(arrived[0])
         self._charge(used[None], size, acknowledged=acknowledged)
         if self._n_all_runs == 1:
@@ -550,11 +570,16 @@ class Channel:
         self._add_to_ledger(bill)
 
     def _add_to_ledger(self, bill: Sequence[Counts]) -> None:
-        """Enter one round without a loss: what each agent sends, in the order of the ledger."""
+        """Enter one round without a loss: what each agent sends, in the order of `_BILLS`."""
         ledger = self._ledger
+        # A graph without links has no rounds.
         rounds = ledger.rounds + (1 if self.graph.senders.size else 0)
-        new = [getattr(ledger, name) + n for name, n in zip(_BILLS, bill, strict=True)]
-        self._ledger = Ledger.construct(rounds, *new[:3], ledger.lost, *new[3:])
+        totals = [
+            getattr(ledger, name) + n for name, n in zip(_BILLS, bill, strict=True)
+        ]
+        by_link = totals[:3]
+        by_broadcast = totals[3:]
+        self._ledger = Ledger.construct(rounds, *by_link, ledger.lost, *by_broadcast)
 
     def _repeat_for_runs(self, used: Mask) -> Mask:
         """Return the links in use, (E,), for each run of this channel, (R, E)."""
@@ -691,7 +716,7 @@ class Channel:
 def _count_payloads(
     payloads: object, agents: int, runs: tuple[int, ...]
 ) -> tuple[list[Payload | None], Counts, Counts]:
-    """Return read-only copies of the agents' payloads, and their scalars and bytes.
+    """Return read-only copies of the agents' payloads, and the scalars and bytes of each, (A,).
 
     Entries that are NaN in all runs are not sent. A payload without any other entry is
     silence, like None, and comes back as None.

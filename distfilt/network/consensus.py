@@ -534,7 +534,8 @@ def admm(
         residuals = np.stack([primal_by_agent, dual_by_agent], axis=1)
         z = new_z
         # After the maximum all agents hold the same two numbers; any row will do.
-        primal, dual = max_consensus(residuals, channel)[0].tolist()
+        largest = max_consensus(residuals, channel)
+        primal, dual = largest[0].tolist()
         if primal < tolerance and dual < tolerance:
             return AdmmResult.construct(z, iteration, primal, dual)
     raise SolverError(

@@ -338,7 +338,10 @@ def _uniform(bits: Hashes) -> Array:
 
 
 def _mix_bits(bits: Hashes | list[int]) -> Hashes:
-    """Apply the finaliser of splitmix64: every output bit depends on every input bit."""
+    """Apply the finaliser of splitmix64: every output bit depends on every input bit.
+
+    The shifts and factors are those that splitmix64 prescribes.
+    """
     z = np.asarray(bits, dtype=np.uint64)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -209,12 +209,13 @@ def arithmetic_average(
         graph = received.graph
         self_weights, link_weights = _intersection_weights(received, "equal")
         difference = received.mean_differences()
-        shift = graph._sum_by_receiver(link_weights[..., None] * difference, 1)
+        shift = graph._sum_by_receiver(link_weights[..., None] * difference, axis=1)
         # The new mean is m = m_i + s with the shift s = Σ_j ω_j (m_j - m_i). The own mean lies at
         # -s from it, a received one at (m_j - m_i) - s.
         deviation = difference - shift[:, graph.receivers]
         weighted = link_weights[..., None, None] * deviation[..., :, None]
-        spread = graph._sum_by_receiver(weighted * deviation[..., None, :], 1)
+        squares = weighted * deviation[..., None, :]
+        spread = graph._sum_by_receiver(squares, axis=1)
         weighted = self_weights[..., None, None] * shift[..., :, None]
         spread += weighted * shift[..., None, :]
         covs = received.sum_matrices(self_weights, link_weights, received.covs)
@@ -272,7 +273,7 @@ def consensus_pull(
     weights = _laplacian_weights(channel.graph, gain)
     if channel.periods:
         for _ in range(rounds):
-            means, _ = _mix_circular(means, channel, weights)
+            means, _self_weights = _mix_circular(means, channel, weights)
         return means, covs.copy()
     # m <- (I - γ L) m; the weight of a lost mean stays with the own one.
     means = channel.mix(means, weights, on_loss="keep", rounds=rounds)
@@ -463,10 +464,11 @@ def _mix_circular(
     difference = flat[:, graph.senders] - flat[:, graph.receivers]
     difference = wrap_differences(difference, channel.periods)
     link_weights = weights.link_weights * arrived
-    shift = graph._sum_by_receiver(link_weights[..., None] * difference, 1)
-    self_weights = 1.0 - graph._sum_by_receiver(link_weights, 1)
+    shift = graph._sum_by_receiver(link_weights[..., None] * difference, axis=1)
+    self_weights = 1.0 - graph._sum_by_receiver(link_weights, axis=1)
     runs = means.shape[:-2]
-    return (flat + shift).reshape(means.shape), self_weights.reshape(*runs, -1)
+    mixed = (flat + shift).reshape(means.shape)
+    return mixed, self_weights.reshape(*runs, -1)
 
 
 @dataclass(eq=False)
@@ -488,7 +490,7 @@ class _Received:
         """Return weighted sums of each agent's matrix, of (R, A, d, d), and the received ones."""
         sent = link_weights[..., None, None] * matrices[:, self.graph.senders]
         own_part = self_weights[..., None, None] * matrices
-        return own_part + self.graph._sum_by_receiver(sent, 1)
+        return own_part + self.graph._sum_by_receiver(sent, axis=1)
 
     def mean_differences(self) -> Array:
         """Return the received mean minus the receiver's, for each link, (R, E, d).
@@ -594,7 +596,7 @@ def _intersection_weights(received: _Received, rule: Rule) -> Pair:
         pair_weights = intersection_weights(pairs, rule=rule)
         size = pair_weights[..., 0] / pair_weights[..., 1]
     link_sizes = size[:, graph.senders] * received.arrived
-    total = size + graph._sum_by_receiver(link_sizes, 1)
+    total = size + graph._sum_by_receiver(link_sizes, axis=1)
     # Normalise each agent's sizes to weights.
     return size / total, link_sizes / total[:, graph.receivers]
 
@@ -636,7 +638,7 @@ def _sum_information(
     # One sum over the links for ω_j P_j⁻¹ and, as a further column, for the pull.
     terms = np.concatenate([of_sender, pull], axis=-1)
     terms *= link_weights[..., None, None]
-    total = graph._sum_by_receiver(terms, 1)
+    total = graph._sum_by_receiver(terms, axis=1)
     own_part = self_weights[..., None, None] * information
     covs = _invert(own_part + total[..., :d])
     shift = (covs @ total[..., d:])[..., 0]
@@ -656,7 +658,7 @@ def _invert(spd: Array) -> Array:
     unit = identity(d)
     solutions = np.empty((n, d, d))
     for k, matrix in enumerate(spd.reshape(n, d, d)):
-        _, solutions[k], failed = dposv(matrix, unit, lower=1)
+        _factor, solutions[k], failed = dposv(matrix, unit, lower=1)
         if failed:
             raise np.linalg.LinAlgError("Matrix is not positive definite")
     return solutions.reshape(spd.shape)

@@ -122,8 +122,8 @@ class Graph(FrozenModel):
             Names of the agents. Nodes that are these names, or numbers written like
             them, are the agents of their label, and so are the numbers 0 to A - 1. A
             graph with other nodes is refused. Without names, nodes that are integers
-            (as labels from 1 on) or tuples of them are numbered in their order, others
-            in the graph's.
+            (as labels from 1 on), also as text, or tuples of them are numbered in their
+            order, others in the graph's.
 
         Examples
         --------
@@ -365,7 +365,7 @@ class Graph(FrozenModel):
     @cached_property
     def components(self) -> Indices:
         """For each agent the number of its (strongly) connected component, (A,)."""
-        _, labels = scipy.sparse.csgraph.connected_components(
+        _n_components, labels = scipy.sparse.csgraph.connected_components(
             self.links, connection="strong"
         )
         return np.asarray(labels, dtype=np.int64)
@@ -425,7 +425,8 @@ def as_graph(
         The number of agents that it must have. Without it, edges have one more agent
         than the largest number in them.
     names : sequence of str
-        Names of the agents, for a networkx graph: see :meth:`Graph.from_networkx`.
+        Names of the agents, for edges between names, and for a networkx graph: see
+        :meth:`Graph.from_networkx`.
 
     Examples
     --------
@@ -437,7 +438,8 @@ def as_graph(
     elif _links.is_networkx(value):
         graph = Graph.from_networkx(value, names)
     elif scipy.sparse.issparse(value) or isinstance(value, np.ndarray | list | tuple):
-        graph = Graph.construct(_links.from_either(value, n_agents, "graph"))
+        edges = _links.number_edges(value, names, "graph")
+        graph = Graph.construct(_links.from_either(edges, n_agents, "graph"))
     else:
         raise InvalidArgumentError(
             "graph must be a Graph, a networkx graph, a matrix of zeros and ones, or "

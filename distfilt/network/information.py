@@ -12,7 +12,13 @@ from ..validation import Array, PositiveInt, call_user, check_array, validated
 from .channel import Channel, LossRule, fusion_rule
 from .consensus import _warn_if_disconnected, average_consensus
 from .fusion import Gaussians, Pair, _invert, _mix_circular
-from .weights import ConsensusWeights, metropolis
+from .graphs import Graph
+from .weights import (
+    ConsensusWeights,
+    _check_same_links,
+    _check_sums_to_one,
+    metropolis,
+)
 
 __all__ = ["diffuse_means", "information_consensus"]
 
@@ -96,7 +102,8 @@ def diffuse_means(
     weights : ConsensusWeights, optional
         The weights c, nonnegative with rows that sum to one; Metropolis by default.
     on_loss : str
-        Where the weight of a lost mean goes: see :meth:`Channel.mix`.
+        Where the weight of a lost mean goes: see :meth:`Channel.mix`; with circular components
+        it is kept.
     rounds : int
         Number of rounds.
 
@@ -114,20 +121,32 @@ def diffuse_means(
     """
     if weights is None:
         weights = metropolis(channel.graph)
-    # A combination with a negative weight is not convex.
-    least = min(weights.self_weights.min(), weights.link_weights.min(initial=0.0))
-    if least < 0:
-        raise ValueError(f"weights must be nonnegative, got {least:g}")
+    else:
+        _check_convex(weights, channel.graph)
     if rounds > 1:
         _warn_if_disconnected(channel)
     means, covs = belief
     if not channel.periods:
         means = channel.mix(means, weights, on_loss=on_loss, rounds=rounds)
         return means, covs.copy()
+    if on_loss != "keep":
+        raise ValueError(
+            f"on_loss must be 'keep' for circular components, got {on_loss!r}"
+        )
     # Angles move by weighted differences, the shorter way round.
     for _ in range(rounds):
-        means, _ = _mix_circular(means, channel, weights)
+        means, _self_weights = _mix_circular(means, channel, weights)
     return means, covs.copy()
+
+
+def _check_convex(weights: ConsensusWeights, graph: Graph) -> None:
+    """Refuse weights of another graph, negative ones, and rows that do not sum to one."""
+    _check_same_links(weights, graph)
+    least = min(weights.self_weights.min(), weights.link_weights.min(initial=0.0))
+    if least < 0:
+        raise ValueError(f"weights must be nonnegative, got {least:g}")
+    purpose = "keep agents that agree as they are"
+    _check_sums_to_one(weights, graph.receivers, "rows", purpose)
 
 
 def to_information(means: Array, covs: Array) -> tuple[Array, Array]:

@@ -76,8 +76,16 @@ class Ledger(FrozenModel):
         ValueError: agents must be at least 1, got 0
         """
         zeros = np.zeros(agents, dtype=np.int64)
-        lost = np.zeros(agents)
-        return cls.construct(0, zeros, zeros, zeros, lost, zeros, zeros, zeros)
+        return cls.construct(
+            rounds=0,
+            messages=zeros,
+            scalars=zeros,
+            bytes=zeros,
+            lost=np.zeros(agents),
+            transmissions=zeros,
+            broadcast_scalars=zeros,
+            broadcast_bytes=zeros,
+        )
 
     def __repr__(self) -> str:
         names = ("messages", "scalars", "bytes", "lost")

@@ -71,13 +71,14 @@ def fuse_on_tree(
     graph = channel.graph
     _check_tree(graph)
     means, covs = belief
+    common_means, common_covs = common
     d = means.shape[-1]
     n_links = graph.senders.size
     m = means.reshape(-1, graph.n_agents, d)
-    link_mean = common[0].reshape(-1, n_links, d)
+    link_mean = common_means.reshape(-1, n_links, d)
     # Information matrices of agents and links
     y = _invert(covs.reshape(-1, graph.n_agents, d, d))
-    link_y = _invert(common[1].reshape(-1, n_links, d, d))
+    link_y = _invert(common_covs.reshape(-1, n_links, d, d))
     faulty = not channel.faults.is_perfect
     arrived = channel._transmit_numbers(d + d * (d + 1) // 2, acknowledged=faulty)
     # Both ends add the other one's information, or neither does.
@@ -92,8 +93,8 @@ def fuse_on_tree(
     shared = _subtract(link_mean, own, channel)
     gained = np.where(is_mutual, y_j - link_y, 0.0)
     pull = np.where(is_mutual, y_j @ other[..., None] - link_y @ shared[..., None], 0.0)
-    new_cov = _invert(y + graph._sum_by_receiver(gained, 1))
-    shift = new_cov @ graph._sum_by_receiver(pull, 1)
+    new_cov = _invert(y + graph._sum_by_receiver(gained, axis=1))
+    shift = new_cov @ graph._sum_by_receiver(pull, axis=1)
     fused_mean = (m + shift[..., 0]).reshape(means.shape)
     fused_cov = symmetrise(new_cov).reshape(covs.shape)
 
@@ -103,8 +104,8 @@ def fuse_on_tree(
     link_cov = _invert(np.where(is_mutual, y_i + y_j - link_y, link_y))
     pull = y_j @ (other - shared)[..., None] - y_i @ shared[..., None]
     shift = link_cov @ np.where(is_mutual, pull, 0.0)
-    new_link = (link_mean + shift[..., 0]).reshape(common[0].shape)
-    new_link_cov = symmetrise(link_cov).reshape(common[1].shape)
+    new_link = (link_mean + shift[..., 0]).reshape(common_means.shape)
+    new_link_cov = symmetrise(link_cov).reshape(common_covs.shape)
     return (fused_mean, fused_cov), (new_link, new_link_cov)
 
 

@@ -237,7 +237,8 @@ def best_constant_edge(graph: Graph) -> ConsensusWeights:
     """
     graph._check_connected()
     if graph.n_agents == 1:
-        return _laplacian_weights(graph, 0.0)
+        # Without links any gain will do.
+        return _laplacian_weights(graph, gain=0.0)
     # 1 - γ λ_2 = -(1 - γ λ_max): both ends of the spectrum have the same modulus.
     eigenvalues = graph.laplacian_spectrum
     gain = 2 / float(eigenvalues[1] + eigenvalues[-1])
@@ -297,7 +298,7 @@ def fastest_mixing(graph: Graph) -> ConsensusWeights:
         solutions.append(solution.x)
 
     def second_modulus(pair_weights: Array) -> float:
-        eigenvalues, _ = _decompose(graph, forward, pair_weights)
+        eigenvalues, _vectors = _decompose(graph, forward, pair_weights)
         return float(np.abs(eigenvalues).max())
 
     # The last need not be the best, where rounding stops the optimiser early.
@@ -480,8 +481,10 @@ def _is_periodic(weights: ConsensusWeights) -> bool:
         return False
     twice = weights.matrix @ weights.matrix
     twice.eliminate_zeros()
-    count, _ = scipy.sparse.csgraph.connected_components(twice, connection="strong")
-    return int(count) > 1
+    n_components, _labels = scipy.sparse.csgraph.connected_components(
+        twice, connection="strong"
+    )
+    return int(n_components) > 1
 
 
 def _measure_growth(weights: ConsensusWeights) -> float:
@@ -527,9 +530,11 @@ def _check_sums_to_one(
     error = np.abs(sums - 1) / np.maximum(1.0, scale)
     worst = int(error.argmax())
     if error[worst] > 1e-9:
+        got = f"{sums[worst]:.6g}"
+        if error[worst] < 1e-6:
+            got = f"one that is {error[worst]:.1e} off, as after single precision,"
         raise ValueError(
-            f"weights must have {name} that sum to 1 to {purpose}, "
-            f"got {sums[worst]:.6g} for agent {worst}"
+            f"weights must have {name} that sum to 1 to {purpose}, got {got} for agent {worst}"
         )
 
 

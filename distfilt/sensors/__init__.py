@@ -14,7 +14,7 @@ from .kinds import (
     stack,
 )
 from .likelihood import LikelihoodSensor
-from .sightings import sighted_cov, sighted_place
+from .sightings import locate_sighting, sighting_cov
 
 __all__ = [
     "LikelihoodSensor",
@@ -27,9 +27,9 @@ __all__ = [
     "from_name",
     "increment",
     "line_angle",
+    "locate_sighting",
     "range_bearing",
-    "sighted_cov",
-    "sighted_place",
+    "sighting_cov",
     "stack",
     "wrap",
 ]

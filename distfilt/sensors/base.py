@@ -42,6 +42,7 @@ from ..validation import (
     validated,
 )
 from ..validation.batching import call_batched
+from ..validation.checks import refuse_mask
 from ..validation.first_use import is_first_use
 
 __all__ = ["Sensor", "wrap"]
@@ -291,9 +292,9 @@ class Sensor(FrozenModel):
             return wrap_differences(difference, cast(Periods, self.periods))
         shape = broadcast_leading(observed.shape, predicted.shape, "predicted")
         # Copies, since the user's function may work in place.
-        residual = np.asarray(
-            call_user(self.residual_function, observed.copy(), predicted.copy())
-        )
+        result = call_user(self.residual_function, observed.copy(), predicted.copy())
+        refuse_mask(result, "residual_function")
+        residual = np.asarray(result)
         # A function written for one observation can lose the leading axes.
         if residual.shape != shape:
             raise ValueError(
@@ -371,3 +372,24 @@ class Sensor(FrozenModel):
             scale=std,
             tolerance=self._noise_std,
         )
+
+
+def count_turns(sensor: Sensor, observed: Array) -> float:
+    """Return by how many of its turns a sensor's values (N, m) are off, at most.
+
+    >>> compass = Sensor(1, lambda x: x, [[1.0]], periods=(2 * np.pi,))
+    >>> round(count_turns(compass, np.array([[90.0]])))
+    14
+    """
+    # y - r(y, 0) is the multiple of the period that wrapping takes off.
+    shift = np.abs(observed - sensor.residual(observed, 0 * observed))
+    if sensor.periods:
+        # A line turns twice while a direction turns once; a period of 360 is in degrees.
+        periods = [p or np.inf for p in cast(Periods, sensor.periods)]
+        turn = np.maximum(periods, 2 * np.pi)
+        return float((shift / turn).max(initial=0.0))
+    full = np.full((1, sensor.dim), 360.0)
+    # A residual of the user's own that takes 360 for a turn is in degrees.
+    if np.abs(sensor.residual(full, 0 * full)).min() < 1e-6:
+        return 0.0
+    return float(shift.max(initial=0.0) / (2 * np.pi))

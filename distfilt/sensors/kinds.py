@@ -69,9 +69,9 @@ def component(
     array([-0.2832])
     """
     return Sensor.construct(
-        len(indices),
-        partial(_select, indices=indices),
-        _diagonal_cov([std] * len(indices)),
+        dim=len(indices),
+        h=partial(_select, indices=indices),
+        noise_cov=_diagonal_cov([std] * len(indices)),
         kind="component",
         linear=partial(_selection_matrix, indices=indices),
         periods=read_periods(periods, len(indices)),
@@ -97,9 +97,9 @@ def increment(
     array([2.])
     """
     return Sensor.construct(
-        len(indices),
-        partial(_increment, indices=indices),
-        _diagonal_cov([std] * len(indices)),
+        dim=len(indices),
+        h=partial(_increment, indices=indices),
+        noise_cov=_diagonal_cov([std] * len(indices)),
         uses_previous=True,
         kind="increment",
         # Not `linear`: H belongs to sensors of the present state alone.
@@ -202,9 +202,9 @@ def distance(
         )
     geometry = _geometry(indices, origin, observer)
     return Sensor.construct(
-        1,
-        partial(_distance, **geometry),
-        _diagonal_cov([std]),
+        dim=1,
+        h=partial(_distance, **geometry),
+        noise_cov=_diagonal_cov([std]),
         kind="distance",
         derivative=partial(_distance_jacobian, **geometry),
     )
@@ -282,7 +282,9 @@ def line_angle(
     >>> sensor.residual([1.5], [-1.5]).round(4)
     array([-0.1416])
     """
-    return _angle_sensor("line_angle", indices, std, origin, None, period=np.pi)
+    return _angle_sensor(
+        "line_angle", indices, std, origin, observer=None, period=np.pi
+    )
 
 
 def _angle_sensor(
@@ -296,9 +298,9 @@ def _angle_sensor(
     """Return the sensor of a direction or of the angle of a line, by its period."""
     geometry = _geometry(indices, origin, observer, has_heading=True)
     return Sensor.construct(
-        1,
-        partial(_angle, period=period, **geometry),
-        _diagonal_cov([std]),
+        dim=1,
+        h=partial(_angle, period=period, **geometry),
+        noise_cov=_diagonal_cov([std]),
         kind=kind,
         derivative=partial(_angle_jacobian, **geometry),
         periods=(period,),
@@ -356,9 +358,9 @@ def range_bearing(
         )
     geometry = _geometry(indices, origin, observer, has_heading=True)
     return Sensor.construct(
-        2,
-        partial(_range_bearing, heading=heading, **geometry),
-        _diagonal_cov(std),
+        dim=2,
+        h=partial(_range_bearing, heading=heading, **geometry),
+        noise_cov=_diagonal_cov(std),
         # Of (distance, bearing) only the second wraps.
         periods=(None, 2 * np.pi),
         kind="range_bearing",
@@ -483,7 +485,7 @@ def _distance_jacobian(
 def _distance_slope(offset: Array, length: Array) -> Array:
     """Return the derivative of vectors' lengths, and zero at the vector zero."""
     # ∂|v|/∂v = vᵀ / |v|
-    return np.asarray(offset / _replace_zeros(length, 1.0))
+    return np.asarray(offset / _replace_zeros(length, value=1.0))
 
 
 def _replace_zeros(length: Array, value: float) -> Array:
@@ -618,9 +620,9 @@ def angles_only(
     array([-2.3562,  0.    ])
     """
     return Sensor.construct(
-        2,
-        partial(_angles_only, form=form, observer=observer, hidden=hidden),
-        _diagonal_cov([std, std]),
+        dim=2,
+        h=partial(_angles_only, form=form, observer=observer, hidden=hidden),
+        noise_cov=_diagonal_cov([std, std]),
         # The first angle is a direction in the plane and repeats after 2π. The second, a
         # declination, lies between -π/2 and π/2. (So does the first in the printed
         # form, an arcsine.)
@@ -734,9 +736,9 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
     if all(sensor.linear is not None for sensor in sensors):
         linear = partial(_stack_matrices, sensors=sensors)
     return Sensor.construct(
-        len(cov),
-        partial(_stack_predictions, sensors=sensors),
-        cov,
+        dim=len(cov),
+        h=partial(_stack_predictions, sensors=sensors),
+        noise_cov=cov,
         kind="stack",
         residual_function=residual_function,
         periods=periods,

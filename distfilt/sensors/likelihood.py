@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from typing import Annotated
@@ -9,6 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from ..linalg import broadcast_leading
+from ..periods import PeriodsArgument
 from ..validation import (
     ALLOW_NAN,
     Array,
@@ -19,10 +21,14 @@ from ..validation import (
     check_array,
     validated,
 )
-from ..validation.first_use import is_first_use
+from ..validation.checks import refuse_mask
+from ..validation.first_use import is_first_use, mark_checked, needs_check
 from .base import Sensor
 
 __all__ = ["LikelihoodSensor"]
+
+_MANY = 20
+"""So many states show what kind of numbers a function returns."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -50,6 +56,9 @@ class LikelihoodSensor(Sensor):
         ``sample(x, rng=rng) -> y``, (..., m): draws, for :meth:`observe`.
     kind : str
         A name, for tables and messages.
+    periods : sequence of (float or None), or mapping, optional
+        The period of each component of the observation that is circular, as of a
+        :class:`~distfilt.sensors.Sensor`: its moments are then compared the shorter way round.
 
     Examples
     --------
@@ -92,6 +101,23 @@ class LikelihoodSensor(Sensor):
     >>> radar = LikelihoodSensor(1, log_radar)
     >>> radar.evaluate([[1.0], [5.0]], [1.5]).round(2)
     array([ -3.66, -48.95])
+
+    A compass with a von Mises distribution, for states with a circular component:
+
+    >>> def log_von_mises(x, y):
+    ...     return 25 * np.cos(y - x)[..., 0]
+    >>> def compass_moments(x):
+    ...     return x, np.full((*x.shape, 1), 0.04)
+    >>> compass = LikelihoodSensor(
+    ...     1, log_von_mises, moments=compass_moments, periods=(2 * np.pi,)
+    ... )
+    >>> turn = Model(
+    ...     1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)), periods=(2 * np.pi,)
+    ... )
+    >>> f = ParticleFilter(turn, [compass], gate_probability=0.999)
+    >>> start = f.start(([3.0], [[0.04]]), rng=np.random.default_rng(0))
+    >>> f.run(start, [1.0], [[[-3.0]]])["mean"].values.ravel().round(1)
+    array([3.1])
     """
 
     log_likelihood: Callable[[Array, Array], Array] = field(kw_only=True)
@@ -108,6 +134,7 @@ class LikelihoodSensor(Sensor):
         moments: Callable[[Array], tuple[Array, Array]] | None = None,
         sample: Callable[..., Array] | None = None,
         kind: str = "likelihood",
+        periods: PeriodsArgument = (),
     ) -> None:
         # The checks below refuse a wrong `dim`; until then `noise_cov` needs some size.
         is_integer = isinstance(dim, int | np.integer) and not isinstance(dim, bool)
@@ -118,6 +145,7 @@ class LikelihoodSensor(Sensor):
             moments=moments,
             sample=sample,
             kind=kind,
+            periods=periods,
             # The parts of a Gaussian sensor; no filter that accepts this one asks for them.
             h=_refuse_to_predict,
             noise_cov=np.eye(dim if is_size else 1),
@@ -138,7 +166,8 @@ class LikelihoodSensor(Sensor):
         previous: Annotated[Array, "... d"] | None = None,
     ) -> Array:
         """Return the mean observation of states (..., d), as (..., m), by `moments`."""
-        return self.predict_moments(x)[0]
+        mean, _cov = self.predict_moments(x)
+        return mean
 
     @validated
     def predict_moments(self, x: Annotated[Array, "... d"]) -> tuple[Array, Array]:
@@ -192,11 +221,29 @@ class LikelihoodSensor(Sensor):
             observed = np.where(
                 is_missing[..., None], observed[~is_missing][0], observed
             )
-        logs = np.asarray(
-            call_user(self.log_likelihood, x.copy(), observed.copy()), dtype=np.float64
-        )
+        result = call_user(self.log_likelihood, x.copy(), observed.copy())
+        refuse_mask(result, "log_likelihood")
+        logs = np.asarray(result, dtype=np.float64)
         self._check_logs(logs, x, observed)
+        self._warn_of_missing_logarithm(logs)
         return np.where(is_missing, 0.0, logs)
+
+    def _warn_of_missing_logarithm(self, logs: Array) -> None:
+        """Warn once if numbers (..., N) look like likelihoods whose logarithm is missing.
+
+        Those of many states are never negative, and tiny for some beside the largest.
+        """
+        if logs.size < _MANY or logs.min() < 0 or not needs_check(self, "logarithm"):
+            return
+        least, largest = logs.min(), logs.max()
+        if least < 1e-3 * largest:
+            mark_checked(self, "logarithm")
+            warnings.warn(
+                f"log_likelihood must return logarithms, got numbers from {least:g} to "
+                f"{largest:g}, as likelihoods are: take np.log of them",
+                RuntimeWarning,
+                stacklevel=4,
+            )
 
     def _check_logs(self, logs: Array, x: Array, observed: Array) -> None:
         """Refuse log-likelihoods of a wrong shape, or that are no numbers."""
@@ -207,6 +254,11 @@ class LikelihoodSensor(Sensor):
                 f"{observed.shape}, got {logs.shape}"
             )
         if not all_finite(logs) and (np.isnan(logs) | (logs == np.inf)).any():
+            if np.isnan(observed[np.isnan(logs)]).any():
+                raise ValueError(
+                    "log_likelihood must return a number where a component of the observation "
+                    "is missing (NaN), the likelihood of the others, got NaN"
+                )
             raise ValueError(
                 "log_likelihood must return numbers or minus infinity (impossible), got NaN or "
                 "infinity"
@@ -219,7 +271,8 @@ class LikelihoodSensor(Sensor):
                 x.reshape(-1, x.shape[-1])[-1].copy(),
                 observed.reshape(-1, self.dim)[-1].copy(),
             )
-            if not np.allclose(last, logs.ravel()[-1], rtol=1e-6, atol=1e-9):
+            is_same = np.allclose(last, logs.ravel()[-1], rtol=1e-6, atol=1e-9)
+            if not is_same:
                 raise ValueError(
                     "log_likelihood must take many states at once, (..., d), components last "
                     "(x[..., 0], not x[0] or x[:, 0]), got one for other axes"

@@ -6,7 +6,7 @@ It begins a landmark that nobody has seen before: place and covariance go to ``r
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -18,13 +18,13 @@ from ..validation import (
     validated,
 )
 
-__all__ = ["sighted_cov", "sighted_place"]
+__all__ = ["locate_sighting", "sighting_cov"]
 
 Point = Annotated[ArrayInput, "2"]
 
 
 @validated
-def sighted_place(
+def locate_sighting(
     x: Annotated[ArrayInput, "... d"], value: Point, *, observer: DistinctIndices
 ) -> Array:
     """Return where a body stands that is seen at a range and bearing, (..., 2).
@@ -42,18 +42,22 @@ def sighted_place(
     --------
     A robot at (1, 0) that heads north sees something two metres ahead:
 
-    >>> from distfilt.sensors import sighted_place
-    >>> sighted_place([1.0, 0.0, np.pi / 2], [2.0, 0.0], observer=[0, 1, 2]).round(4)
+    >>> from distfilt.sensors import locate_sighting
+    >>> locate_sighting([1.0, 0.0, np.pi / 2], [2.0, 0.0], observer=[0, 1, 2]).round(4)
     array([1., 2.])
     """
-    east, north, heading = _pose(x, observer)
-    angle = heading + value[1]
-    place = [east + value[0] * np.cos(angle), north + value[0] * np.sin(angle)]
+    distance, bearing = value
+    pose = _read_pose(x, observer)
+    angle = pose.heading + bearing
+    place = [
+        pose.east + distance * np.cos(angle),
+        pose.north + distance * np.sin(angle),
+    ]
     return np.stack(place, axis=-1)
 
 
 @validated
-def sighted_cov(
+def sighting_cov(
     x: Annotated[ArrayInput, "... d"],
     value: Point,
     cov: Annotated[PositiveSemidefinite, "2 2"],
@@ -63,7 +67,7 @@ def sighted_cov(
     r"""Return the covariance that a sighting's noise gives the place, (..., 2, 2).
 
     It is :math:`\mathbf V\mathbf R\mathbf V^\top` with the derivative :math:`\mathbf V` of
-    `sighted_place` by the range and the bearing; the observer's own error is not in it.
+    `locate_sighting` by the range and the bearing; the observer's own error is not in it.
 
     Parameters
     ----------
@@ -78,30 +82,38 @@ def sighted_cov(
     --------
     Ten metres ahead, an error of the bearing moves the place sideways by ten times as much:
 
-    >>> from distfilt.sensors import sighted_cov
+    >>> from distfilt.sensors import sighting_cov
     >>> R = np.diag([0.1**2, 0.02**2])
-    >>> sighted_cov([0.0, 0.0, 0.0], [10.0, 0.0], R, observer=[0, 1, 2]).round(4)
+    >>> sighting_cov([0.0, 0.0, 0.0], [10.0, 0.0], R, observer=[0, 1, 2]).round(4)
     array([[0.01, 0.  ],
            [0.  , 0.04]])
     """
-    _, _, heading = _pose(x, observer)
-    angle = heading + value[1]
+    distance, bearing = value
+    angle = _read_pose(x, observer).heading + bearing
     c = np.cos(angle)
     s = np.sin(angle)
     # Columns: along the ray for the range, and across it, r times as long, for the bearing.
     rows = [
-        np.stack([c, -value[0] * s], axis=-1),
-        np.stack([s, value[0] * c], axis=-1),
+        np.stack([c, -distance * s], axis=-1),
+        np.stack([s, distance * c], axis=-1),
     ]
     slope = np.stack(rows, axis=-2)
     return np.asarray(slope @ cov @ slope.mT)
 
 
-def _pose(x: Array, observer: Sequence[int]) -> tuple[Array, Array, Array]:
-    """Return east, north and heading of the observer, each (...)."""
+class _Pose(NamedTuple):
+    """East, north and heading of an observer, each (...)."""
+
+    east: Array
+    north: Array
+    heading: Array
+
+
+def _read_pose(x: Array, observer: Sequence[int]) -> _Pose:
+    """Return the pose of the observer in states (..., d)."""
     if len(observer) != 3:
         raise ValueError(
             f"observer must have three entries, x, y and heading, got {len(observer)}"
         )
-    east, north, heading = (x[..., k] for k in observer)
-    return east, north, heading
+    east, north, heading = observer
+    return _Pose(x[..., east], x[..., north], x[..., heading])

@@ -16,7 +16,7 @@ import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
-from typing import Annotated, Literal, Protocol, runtime_checkable
+from typing import Annotated, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -441,19 +441,19 @@ def _solve_component(design: Array, solver: str) -> Array:
     """Return the coefficients (n,) of one component for features (N, n), by a conic solver."""
     cp = import_optional("cvxpy", "maps")
     n = design.shape[-1]
-    problem, root, coefficients = _compile_program(n)
+    program = _compile_program(n)
     # R of the features Z = Q R, by which the program depends on them.
-    root.value = np.asarray(np.linalg.qr(design, mode="r"))
+    program.root.value = np.asarray(np.linalg.qr(design, mode="r"))
     try:
-        problem.solve(solver=solver, warm_start=False)
-        status = problem.status
+        program.problem.solve(solver=solver, warm_start=False)
+        status = program.problem.status
     except cp.error.SolverError as error:
         status = error
     if status != cp.OPTIMAL:
         raise SolverError(
             f"{solver}: component {n - 1} of the map stopped with {status!r}"
         )
-    return np.asarray(coefficients.value)
+    return np.asarray(program.coefficients.value)
 
 
 class _Symbol(Protocol):
@@ -462,7 +462,7 @@ class _Symbol(Protocol):
     value: Array | None
 
 
-class _Program(Protocol):
+class _Problem(Protocol):
     """A problem of cvxpy, as far as it is used here."""
 
     @property
@@ -471,9 +471,17 @@ class _Program(Protocol):
     def solve(self, *, solver: str, warm_start: bool) -> float: ...
 
 
+class _Program(NamedTuple):
+    """A problem with the parameter R (n, n) and the variable u (n,), the coefficients."""
+
+    problem: _Problem
+    root: _Symbol
+    coefficients: _Symbol
+
+
 @lru_cache(maxsize=32)
-def _compile_program(n: int) -> tuple[_Program, _Symbol, _Symbol]:
-    """Return the program (12) of Grange et al. for n coefficients, its parameter and its variable.
+def _compile_program(n: int) -> _Program:
+    """Return the program (12) of Grange et al. for n coefficients.
 
     It minimises |Z u|² / 2 - log u_n, where a row of Z has the features of a sample over √N. With
     Z = Q R the first term is |R u|² / 2, so that R (n, n) is the parameter, and one program serves
@@ -485,4 +493,4 @@ def _compile_program(n: int) -> tuple[_Program, _Symbol, _Symbol]:
     squares = cp.sum_squares(root @ coefficients) / 2
     # The last coefficient is the derivative in the component's own variable.
     loss = squares - cp.log(coefficients[n - 1])
-    return cp.Problem(cp.Minimize(loss)), root, coefficients
+    return _Program(cp.Problem(cp.Minimize(loss)), root, coefficients)

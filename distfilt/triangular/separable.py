@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -134,7 +135,7 @@ class SeparableMap:
         for k in range(self.dim):
             # A function of the earlier variables, and an increasing one of the own variable.
             v = joint[..., self.n_observed + k]
-            increasing, _ = self._increasing_part(v, k)
+            increasing, _rate = self._increasing_part(v, k)
             components.append(self._earlier_part(joint, k) + increasing)
         return np.stack(components, axis=-1)
 
@@ -174,7 +175,7 @@ class SeparableMap:
         log_scale = np.log(self.std[..., m:]).sum(axis=-1)
         total = -log_scale[..., None]
         for k in range(self.dim):
-            _, rate = self._increasing_part(joint[..., m + k], k)
+            _value, rate = self._increasing_part(joint[..., m + k], k)
             total = total + np.log(rate)
         return np.asarray(total)
 
@@ -292,11 +293,12 @@ def fit(
             f"x must have more than {n_coefficients} members for as many coefficients, "
             f"got {x.shape[-2]}"
         )
-    joint, centre, std = _standardise_samples(y, x)
+    samples = _standardise_samples(y, x)
+    joint = samples.joint
     _check_combinations(joint, allowed, m)
-    bumps = _place_bumps(joint, n_bumps, m)
+    bumps = _place_bumps(joint, n_bumps, n_observed=m)
     # Integrated bumps are smooth steps; only the state's variables have them.
-    steps = _place_bumps(joint[..., m:], n_steps, 0)
+    steps = _place_bumps(joint[..., m:], n_steps, n_observed=0)
     weights = []
     slopes = []
     for k, used in enumerate(allowed):
@@ -310,7 +312,9 @@ def fit(
         )
         weights.append(weight)
         slopes.append(slope)
-    return SeparableMap(m, centre, std, bumps, steps, allowed, weights, slopes)
+    return SeparableMap(
+        m, samples.centre, samples.std, bumps, steps, allowed, weights, slopes
+    )
 
 
 def _check_uses(
@@ -334,8 +338,16 @@ def _check_uses(
     return allowed
 
 
-def _standardise_samples(y: Array, x: Array) -> tuple[Array, Array, Array]:
-    """Return standardised samples (y, x), (..., N, m + d), and their means and deviations."""
+class _StandardSamples(NamedTuple):
+    """Standardised samples (y, x), (..., N, m + d), and their means and deviations (..., m + d)."""
+
+    joint: Array
+    centre: Array
+    std: Array
+
+
+def _standardise_samples(y: Array, x: Array) -> _StandardSamples:
+    """Return samples (y, x) with mean zero and variance one."""
     joint = join_samples(y, x)
     centre = ensembles.mean(joint)
     joint -= centre[..., None, :]
@@ -346,7 +358,7 @@ def _standardise_samples(y: Array, x: Array) -> tuple[Array, Array, Array]:
     # Refuse constant ones: the error names the first, as a column of y or of x.
     check_variables(is_constant, y.shape[-1], needs="are not constant")
     joint /= std[..., None, :]
-    return joint, centre, std
+    return _StandardSamples(joint, centre, std)
 
 
 def _check_combinations(joint: Array, uses: list[list[int]], m: int) -> None:
@@ -368,10 +380,11 @@ def _check_combinations(joint: Array, uses: list[list[int]], m: int) -> None:
                 )
 
 
-def _place_bumps(joint: Array, n: int, m: int) -> Array:
+def _place_bumps(joint: Array, n: int, *, n_observed: int) -> Array:
     """Return `n` centres for each variable, at sample quantiles, and widths, (2, ..., D, n).
 
-    The samples `joint` are (..., N, D). An error names a variable: the first m are y, others x.
+    The samples `joint` are (..., N, D). An error names a variable: the first ones observed
+    are y, the others x.
     """
     # 2 n + 1 equally spaced levels: every second one is a centre, and its width is the distance
     # of the two levels next to it.
@@ -384,7 +397,7 @@ def _place_bumps(joint: Array, n: int, m: int) -> Array:
     widths = np.diff(edges, axis=-1)
     is_degenerate = np.any(widths <= 0, axis=-1)
     needs = "have quantiles that differ for the basis functions"
-    check_variables(is_degenerate, m, needs)
+    check_variables(is_degenerate, n_observed, needs)
     return np.stack([centres, widths])
 
 
@@ -490,6 +503,7 @@ def _search_projected(
     :func:`_minimise_nonnegative` and its gradient.
     """
     before = _loss(start, quadratic, rates)
+    # The loss is of the order of one, with a rounding of some 1e-15.
     rounding = 1e-14 * (1 + np.abs(before))
     length = np.ones(start.shape[:-1])
     for _ in range(_HALVINGS):
@@ -538,6 +552,7 @@ def invert(
         high = np.where(error >= 0, v, high)
         newton = v - error / derivative
         change = np.abs(newton - v)
+        # A few hundred units of rounding.
         tolerance = 1e-13 * (1 + np.abs(v))
         # Newton's step is taken where it is inside the bracket and at most half as long as the
         # last, or the method could alternate for ever; and where it is within the tolerance, when

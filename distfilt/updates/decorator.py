@@ -130,7 +130,7 @@ def _share_leading_axes(arrays: dict[str, Array]) -> dict[str, Array]:
     if leads[0] == leads[1] == lead and leads[2] in ((), lead):
         return {}
     # The function may call its arguments as it likes.
-    _, name_predicted, name_observed, name_noise = arrays
+    _name_ensemble, name_predicted, name_observed, name_noise = arrays
     names = (name_predicted, name_observed, name_noise)
     for name, axes in zip(names, leads, strict=True):
         # The ensemble's axes are the result's: no other argument may add to them.
@@ -471,7 +471,7 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
 
 
 def _draw_rows(
-    name: str, parameters: tuple[str, ...], by_row: bool
+    name: str, parameters: tuple[str, ...], *, by_row: bool
 ) -> Callable[..., Array]:
     """Return the method of a distribution that draws for the batch and selects the rows.
 
@@ -516,6 +516,6 @@ def _draw_rows(
 
 
 for _name, _parameters in _PARAMETERS.items():
-    setattr(RowGenerator, _name, _draw_rows(_name, _parameters, True))
+    setattr(RowGenerator, _name, _draw_rows(_name, _parameters, by_row=True))
 for _name, _parameters in _EVENTS.items():
-    setattr(RowGenerator, _name, _draw_rows(_name, _parameters, False))
+    setattr(RowGenerator, _name, _draw_rows(_name, _parameters, by_row=False))

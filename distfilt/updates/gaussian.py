@@ -98,8 +98,8 @@ def enkf_sampled_covariance(
         )
     perturbed = perturb_observations(predicted, noise, rng)
     # Without R: it is in the sample covariance of the perturbed predictions.
-    anomalies = center_ensemble(ensemble)[1]
-    gain = _solve_gain(anomalies, center_ensemble(perturbed)[1])
+    anomalies = center_ensemble(ensemble).anomalies
+    gain = _solve_gain(anomalies, center_ensemble(perturbed).anomalies)
     # x_i + K (y* - y_i), as rows.
     innovations = observed[..., None, :] - perturbed
     return np.asarray(ensemble + innovations @ gain)
@@ -138,8 +138,8 @@ def enkf(
     (np.float64(0.5), np.float64(0.5))
     """
     perturbed = perturb_observations(predicted, noise, rng, centred=centred)
-    anomalies = center_ensemble(ensemble)[1]
-    gain = _solve_gain(anomalies, center_ensemble(predicted)[1], noise)
+    anomalies = center_ensemble(ensemble).anomalies
+    gain = _solve_gain(anomalies, center_ensemble(predicted).anomalies, noise)
     # x_i + K (y* - y_i) with the perturbed predictions y_i; the results overwrite arrays that were
     # made here, which saves time.
     innovations = np.subtract(observed[..., None, :], perturbed, out=perturbed)
@@ -173,8 +173,8 @@ def enkf_exact(
     >>> float(after.mean().round(12)), float(after.var(ddof=1).round(12))
     (0.5, 0.25)
     """
-    anomalies = center_ensemble(ensemble)[1]
-    predicted_anomalies = center_ensemble(predicted)[1]
+    anomalies = center_ensemble(ensemble).anomalies
+    predicted_anomalies = center_ensemble(predicted).anomalies
     # Orthogonal to both, so that no sample covariance with the draws enters P⁺.
     joint_anomalies = np.concatenate([anomalies, predicted_anomalies], axis=-1)
     draws = exact_noise(joint_anomalies, cholesky(noise), rng)
@@ -229,7 +229,7 @@ def etkf(
     # S = U D Vᵀ, so (I + S Sᵀ)^(-1/2) = I + U ((1 + D²)^(-1/2) - 1) Uᵀ.
     root = np.linalg.cholesky(noise)
     whitened = np.linalg.solve(root, predicted_anomalies.mT).mT / np.sqrt(n - 1)
-    u, sizes, _ = np.linalg.svd(whitened, full_matrices=False)
+    u, sizes, _vh = np.linalg.svd(whitened, full_matrices=False)
     shrinkage = 1 / np.sqrt(1 + sizes**2) - 1
     anomalies = anomalies + (u * shrinkage[..., None, :]) @ (u.mT @ anomalies)
     # Two centred members have one direction only.
@@ -355,5 +355,5 @@ def exact_forecast(
     # anyway; the result is NaN.
     failed = ~np.isfinite(forecast).all(axis=(-2, -1), keepdims=True)
     finite = np.where(failed, ensemble, forecast)
-    noisy = finite + exact_noise(center_ensemble(finite)[1], root, rng)
+    noisy = finite + exact_noise(center_ensemble(finite).anomalies, root, rng)
     return np.where(failed, np.nan, noisy)

@@ -54,20 +54,26 @@ def effective_size(log_weights: ArrayLike) -> Array:
     >>> float(effective_size(np.log([0.5, 0.25, 0.25])).round(4))
     2.6667
     """
-    return size_of(normalize_weights(log_weights))
+    return effective_size_of(normalize_weights(log_weights))
 
 
-def size_of(weights: Array) -> Array:
+def effective_size_of(weights: Array) -> Array:
     """Return the effective sample size 1 / Σ w² of weights (..., N) that sum to one."""
     return np.asarray(1 / (weights * weights).sum(axis=-1))
 
 
-def warn_of_collapse(problem: str, option: str) -> None:
-    """Warn the caller of a filter, or of an update, that a belief depends on few members.
+def describe_collapse(problem: str, option: str) -> str:
+    """Return the text of a warning that a belief depends on few members.
 
-    The message states the problem and names an option of the filter that helps.
+    It states the problem and names an option of the filter that helps.
     """
-    text = f"{problem}; use more members, {option}, or more process noise"
+    return f"{problem}; use more members, {option}, or more process noise"
+
+
+def warn_of_collapse(problem: str) -> None:
+    """Warn the caller of an update by an ensemble that its belief depends on few members."""
+    # The option of the filter that helps is rejuvenation.
+    text = describe_collapse(problem, "rejuvenation=")
     warnings.warn(text, ParticleCollapse, stacklevel=4)
 
 
@@ -111,12 +117,11 @@ def warn_of_weights(
     """
     weights = np.exp(log_weights - log_sum_exp(log_weights))
     # The initial value is for a batch without ensembles.
-    smallest_size = size_of(weights).min(initial=np.inf)
-    # An effective size of 1.1 means that one member has 95 % of the weight. The warning names the
-    # filter's option that helps, rejuvenation.
+    smallest_size = effective_size_of(weights).min(initial=np.inf)
+    # An effective size of 1.1 means that one member has 95 % of the weight.
     if smallest_size < 1.1:
         problem = f"an ensemble's weights have an effective size of {smallest_size:.1f}"
-        warn_of_collapse(problem, "rejuvenation=")
+        warn_of_collapse(problem)
         return
     m = observed.shape[-1]
     distances = _mahalanobis_squared(predicted, observed, noise)
@@ -129,7 +134,7 @@ def warn_of_weights(
             f"an observation's squared distance from an ensemble's predictions is "
             f"{largest_distance:.0f}, not {m}"
         )
-        warn_of_collapse(problem, "rejuvenation=")
+        warn_of_collapse(problem)
 
 
 def _mahalanobis_squared(predicted: Array, observed: Array, noise: Array) -> Array:

@@ -14,6 +14,7 @@ from ..triangular.affine import ConditionalMap
 from ..validation import (
     Array,
     Bounds,
+    Mask,
     NonNegativeFloat,
     PositiveInt,
     Rng,
@@ -33,6 +34,9 @@ __all__ = [
 Factor = Annotated[float, Bounds(at_least=0, at_most=1e100)]
 Fit = Callable[[Array, Array], ConditionalMap]
 """``fit(y, x) -> map``: an estimator of the map that takes the samples to the reference."""
+
+_ROUNDING = 1e-6
+"""The part of a component, relative to it, that others leave unexplained by rounding."""
 
 
 def _perturb(predicted: Array, noise: Array, factor: float, rng: Rng) -> Array:
@@ -61,7 +65,8 @@ def transport_map_update(
     """Condition an ensemble with a composed map, equations (10)-(13) of Grange et al.
 
     With the affine map, the default, this is exactly the stochastic ensemble Kalman filter with
-    sample covariances, :func:`~distfilt.updates.enkf_sampled_covariance`.
+    sample covariances, :func:`~distfilt.updates.enkf_sampled_covariance`. Components that are
+    constant over the members, or combinations of others, follow from the others.
 
     Parameters
     ----------
@@ -85,7 +90,55 @@ def transport_map_update(
     """
     # Joint samples: predictions with noise, and members.
     perturbed = _perturb(predicted, noise, noise_factor, rng)
-    return _condition(fit, perturbed, ensemble, observed)
+    try:
+        return _condition(fit, perturbed, ensemble, observed)
+    except ValueError:
+        is_free = _find_independent(ensemble)
+        if is_free.all():
+            raise
+    return _condition_independent(fit, perturbed, ensemble, observed, is_free)
+
+
+def _find_independent(ensemble: Array) -> Mask:
+    """Return which components (d,) of members (..., N, d) those before them do not determine.
+
+    A known constant is determined, and so is a linear combination, in all ensembles of the stack.
+
+    >>> x = np.random.default_rng(0).standard_normal((20, 2))
+    >>> _find_independent(np.c_[x[:, 0], 3 * x[:, 0] - 1, np.full(20, 7.0), x[:, 1]])
+    array([ True, False, False,  True])
+    """
+    centre = ensemble.mean(axis=-2)
+    anomalies = ensemble - centre[..., None, :]
+    r = np.linalg.qr(anomalies, mode="r")
+    # |R_kk| is the part of component k that those before it do not explain, and column k of R is as
+    # long as its anomalies. The rounding of the mean, which has been subtracted, counts too.
+    length = np.linalg.norm(r, axis=-2)
+    part = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
+    n = np.sqrt(ensemble.shape[-2])
+    is_free = part > _ROUNDING * length + n * 32 * np.spacing(np.abs(centre))
+    return np.asarray(is_free.reshape(-1, ensemble.shape[-1]).any(axis=0))
+
+
+def _condition_independent(
+    fit: Fit, perturbed: Array, ensemble: Array, observed: Array, is_free: Mask
+) -> Array:
+    """Condition the independent components of members (..., N, d); the others follow from them."""
+    if not is_free.any():
+        return ensemble
+    free = ensemble[..., is_free]
+    moved = _condition(fit, perturbed, free, observed)
+    # z - m_z = (x - m_x) B, exactly
+    centre = free.mean(axis=-2, keepdims=True)
+    rest = ensemble[..., ~is_free]
+    rest_centre = rest.mean(axis=-2, keepdims=True)
+    anomalies = free - centre
+    std = anomalies.std(axis=-2, keepdims=True)
+    factors = np.linalg.pinv(anomalies / std) @ (rest - rest_centre)
+    result = ensemble.copy()
+    result[..., is_free] = moved
+    result[..., ~is_free] = rest_centre + ((moved - centre) / std) @ factors
+    return result
 
 
 @validated
@@ -111,7 +164,7 @@ def principal_directions(ensemble: Ensemble, n: PositiveInt) -> Array:
         raise ValueError("ensemble must have members of finite variance, got infinity")
     Bounds(at_most=covariance.shape[-1])(n, "n")
     # Eigenvalues come in ascending order.
-    _, vectors = np.linalg.eigh(covariance)
+    vectors = np.linalg.eigh(covariance).eigenvectors
     directions = vectors[..., ::-1][..., :n]
     # The sign is arbitrary: the largest entry becomes positive.
     largest = np.abs(directions).argmax(axis=-2)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Literal, cast
+from typing import Annotated, Literal, NamedTuple, cast
 
 import numpy as np
 
@@ -296,7 +296,7 @@ def serially(update: Update) -> Update:
     >>> float(after.mean().round(12)), float(after.var(ddof=1).round(12))
     (0.5, 0.25)
     """
-    return _apply_in_turn(update, None)
+    return _apply_in_turn(update, find_taper=None)
 
 
 Periods = PositiveFloat | Annotated[ArrayInput, "k", ALLOW_NAN]
@@ -613,8 +613,18 @@ class _Group:
         return np.asarray(state + rho * (analysis - state))
 
 
+class _TaperedMoments(NamedTuple):
+    """N - 1 times the tapered moments of a combination of observations.
+
+    Its covariances with the components of the state, (..., k), and its variance, (...).
+    """
+
+    cov: Array
+    variance: Array
+
+
 @dataclass(frozen=True)
-class _Mixture:
+class _Combination:
     """A combination of correlated observations in different places, made by whitening.
 
     Its value is sum_j w_j y_j over the g observations `indices`; its noise has unit variance and is
@@ -643,47 +653,61 @@ class _Mixture:
         :meth:`_Group.apply`.
         """
         # Combinations are made only where there is a taper, (..., d + m, m).
-        local = cast(Array, taper)
-        rho = local[..., self.indices]
-        d = local.shape[-2] - local.shape[-1]
-        # d, or d + m if the predictions are components of the state too.
-        n_state = state.shape[-1]
-        weights = self.weights[..., None, :]
+        taper = cast(Array, taper)
         parts, is_predicted = self._select_parts(predicted)
-        mixed = (weights * parts).sum(axis=-1, keepdims=True)
-        # Anomalies, and their products summed over the members.
+        combined = (self.weights[..., None, :] * parts).sum(axis=-1, keepdims=True)
+        mean = combined.mean(axis=-2, keepdims=True)
+        # Anomalies of the state and of the combination, (..., N, k) and (..., N, 1).
         x = state - state.mean(axis=-2, keepdims=True)
-        h = parts - parts.mean(axis=-2, keepdims=True)
-        z = mixed - mixed.mean(axis=-2, keepdims=True)
-        # sum_j w_j rho_kj cov(x_k, h_j), and the mixture's tapered variance, (...). The rows d and
-        # on of the taper are those of the observations. All are N - 1 times (co)variances.
-        local_cov = (rho[..., :n_state, :] * weights * (x.mT @ h)).sum(axis=-1)
-        rho_between = rho[..., d + self.indices, :]
-        products = weights.mT * weights * rho_between * (h.mT @ h)
-        local_variance = np.maximum(products.sum(axis=(-2, -1)), 0.0)
+        z = combined - mean
         variance = (z * z).sum(axis=(-2, -1))
+        tapered = self._taper_moments(x, parts, taper)
         # Without variance there is no gain; NaN leaves the ensemble as it is.
-        is_used = (variance > 0) & (local_variance > 0) & is_predicted
+        is_used = (variance > 0) & (tapered.variance > 0) & is_predicted
         target = np.where(is_used, self.value, np.nan)[..., None]
         # The update gets a prediction that is scaled to the tapered variance. It is also appended
         # to the state, so that its own change is known afterwards.
         ratio = np.ones_like(variance)
-        np.divide(local_variance, variance, out=ratio, where=is_used)
+        np.divide(tapered.variance, variance, out=ratio, where=is_used)
         z = np.sqrt(ratio)[..., None, None] * z
-        tapered = mixed.mean(axis=-2, keepdims=True) + z
-        extended = np.concatenate([state, tapered], axis=-1)
-        analysis = with_missing(update, extended, tapered, target, np.eye(1), rng=rng)
+        prediction = mean + z
+        extended = np.concatenate([state, prediction], axis=-1)
+        analysis = with_missing(
+            update, extended, prediction, target, np.eye(1), rng=rng
+        )
         change = analysis - extended
         # An update by a gain changes member i by c_i cov(x, z) in every component, and z itself by
         # c_i var(z). That gives c_i, and the state then moves by the tapered covariance.
-        divisor = np.where(is_used, local_variance, 1.0)[..., None, None]
+        n_state = state.shape[-1]
+        divisor = np.where(is_used, tapered.variance, 1.0)[..., None, None]
         c = change[..., n_state:] / divisor
-        by_gain = c * local_cov[..., None, :]
+        by_gain = c * tapered.cov[..., None, :]
         # Other updates change the state by more than that. This remainder cannot be divided among
         # the parts j, so it gets their mean taper.
         remainder = change[..., :n_state] - c * (x.mT @ z).mT
-        mean_rho = self._average_taper(rho[..., :n_state, :])
-        return np.asarray(state + by_gain + mean_rho[..., None, :] * remainder)
+        rho = taper[..., self.indices]
+        mean_taper = self._average_taper(rho[..., :n_state, :])
+        return np.asarray(state + by_gain + mean_taper[..., None, :] * remainder)
+
+    def _taper_moments(self, x: Array, parts: Array, taper: Array) -> _TaperedMoments:
+        """Return the tapered moments of the combination of parts h_j (..., N, g).
+
+        `x` (..., N, k) has the anomalies of the state: of its d components, and of the m
+        predictions if these are updated too.
+        """
+        # rho of the parts, (..., d + m, g): the rows d and on are those of the observations.
+        rho = taper[..., self.indices]
+        d = taper.shape[-2] - taper.shape[-1]
+        rho_of_state = rho[..., : x.shape[-1], :]
+        rho_between = rho[..., d + self.indices, :]
+        weights = self.weights[..., None, :]
+        h = parts - parts.mean(axis=-2, keepdims=True)
+        # sum_j w_j rho_kj cov(x_k, h_j)
+        cov = (rho_of_state * weights * (x.mT @ h)).sum(axis=-1)
+        # sum_ij w_i w_j rho_ij cov(h_i, h_j), which a taper may make negative.
+        products = weights.mT * weights * rho_between * (h.mT @ h)
+        variance = np.maximum(products.sum(axis=(-2, -1)), 0.0)
+        return _TaperedMoments(cov, variance)
 
     def _select_parts(self, predicted: Array) -> tuple[Array, Mask]:
         """Return the g predictions (..., N, g) that are combined, and whether they exist (...).
@@ -707,12 +731,12 @@ class _Mixture:
 
 def _plan_turns(
     observed: Array, noise: Array, taper: Array | None
-) -> list[_Group | _Mixture]:
+) -> list[_Group | _Combination]:
     """Return what is assimilated in turn: groups in one place, and whitened observations.
 
     Observations are (..., m), their noise covariance (..., m, m), the taper (..., d + m, m).
     """
-    turns: list[_Group | _Mixture] = []
+    turns: list[_Group | _Combination] = []
     rounding = 0.0 if taper is None else _ROUNDING
     for group in _group_correlated(noise, rounding):
         # Observations in one place have the same taper: they can be assimilated together, as all
@@ -729,8 +753,8 @@ def _plan_turns(
     return turns
 
 
-def _whiten(group: Indices, observed: Array, noise: Array) -> list[_Mixture]:
-    """Return g mixtures of g correlated observations, with independent noise of unit variance.
+def _whiten(group: Indices, observed: Array, noise: Array) -> list[_Combination]:
+    """Return g combinations of g correlated observations, with independent noise of unit variance.
 
     `group` (g,) are their indices, `observed` (..., g) their values, NaN where missing; `noise`
     (..., m, m) is the covariance of all.
@@ -748,7 +772,7 @@ def _whiten(group: Indices, observed: Array, noise: Array) -> list[_Mixture]:
     mixed = (whitening @ values[..., None])[..., 0]
     mixed = np.where(missing, np.nan, mixed)
     return [
-        _Mixture(group, np.asarray(whitening[..., i, :]), mixed[..., i])
+        _Combination(group, np.asarray(whitening[..., i, :]), mixed[..., i])
         for i in range(g)
     ]
 
@@ -779,7 +803,7 @@ def _group_correlated(noise: Array, rounding: float = 0.0) -> list[Indices]:
     in_any = is_correlated.reshape(-1, *noise.shape[-2:]).any(axis=0)
     # Groups are the connected components of the graph of correlations.
     graph = csr_array(in_any)
-    labels = csgraph.connected_components(graph, directed=False)[1]
+    _n_components, labels = csgraph.connected_components(graph, directed=False)
     # Each label once, in the order in which they first come.
     distinct_labels = dict.fromkeys(labels.tolist())
     return [np.flatnonzero(labels == label) for label in distinct_labels]

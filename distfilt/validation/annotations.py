@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import date, timedelta
 from functools import cache, partial
 from types import EllipsisType, UnionType
 from typing import Annotated, Any, Literal, TypeAlias, Union, get_args, get_origin
@@ -19,6 +20,7 @@ from .checks import (
     Mask,
     Shape,
     check_array,
+    describe_conversion,
     describe_misshape,
     format_shape,
     match_shape,
@@ -126,11 +128,21 @@ class ArgumentConstraint:
             is_short = isinstance(value, str | int | float)
             text = repr(value) if is_short else type_name(value)
             raise InvalidArgumentError(
-                f"{name} must be {self.description}, got {text}"
+                f"{name} must be {self.description}, got {text}{_describe_time(value)}"
             ) from None
         for rule in self.rules:
             rule(result, name)
         return result
+
+
+def _describe_time(value: object) -> str:
+    """Return how to turn a time of a calendar, or a duration, into seconds; otherwise nothing.
+
+    >>> _describe_time(np.timedelta64(5, "ms"))
+    ': give seconds, x / np.timedelta64(1, "s")'
+    """
+    is_time = isinstance(value, date | timedelta | np.datetime64 | np.timedelta64)
+    return describe_conversion(value) if is_time else ""
 
 
 def _convert_float(value: object, name: str, context: CallContext) -> float:
@@ -235,16 +247,17 @@ def _convert_array(
         is_masked = isinstance(value, np.ma.MaskedArray)
         if array.dtype.kind not in dtype_kinds or is_masked:
             raise TypeError
+    # Names of axes stand for the sizes that earlier arguments have given them.
     if shape is not None and not context.bind_shape(array.shape, shape):
         names = context.resolve(shape.names)
         raise ValueError(
             f"{name} must have shape {format_shape(names)}, got {array.shape}"
-            f"{describe_misshape(array.shape, names) or _find_column(array.shape, context)}"
+            f"{describe_misshape(array.shape, names) or _hint_at_column(array.shape, context)}"
         )
     return array
 
 
-def _find_column(shape: tuple[int, ...], context: CallContext) -> str:
+def _hint_at_column(shape: tuple[int, ...], context: CallContext) -> str:
     """Return a hint at an earlier argument whose column of numbers made this shape look wrong.
 
     A column (n, 1) has bound the size of an axis to 1, where n was meant. Without one return "".

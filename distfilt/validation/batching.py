@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .checks import Array
+from .checks import Array, refuse_mask
 from .decorators import call_user
 from .first_use import mark_checked, needs_check
 
@@ -78,7 +78,7 @@ def call_batched(
     function = getattr(owner, name)
     # The first argument is the present state; another may be the previous one.
     x = states[0]
-    result = _call_or_catch(function, states, args)
+    result = _call_or_catch(name, function, states, args)
     expected = (*x.shape[:-1], owner.dim)
     check = name_of_check(name, x)
     # The usual case: it has been checked before, and its result has the right shape.
@@ -121,8 +121,8 @@ def _compare_with_single_state(
     function = getattr(owner, name)
     expected = (*states[0].shape[:-1], owner.dim)
     last_states = [state.reshape(-1, state.shape[-1])[-1] for state in states]
-    single = _call_or_catch(function, last_states, args)
-    _refuse_draws(name, single, _call_or_catch(function, last_states, args))
+    single = _call_or_catch(name, function, last_states, args)
+    _refuse_draws(name, single, _call_or_catch(name, function, last_states, args))
     if isinstance(result, np.ndarray) and result.shape == expected:
         last_row = result.reshape(-1, owner.dim)[-1]
         differs = _is_different(last_row, single, last_states)
@@ -132,7 +132,7 @@ def _compare_with_single_state(
         copies = []
         for last, state in zip(last_states, states, strict=True):
             copies.append(np.broadcast_to(last, state.shape))
-        repeated = _call_or_catch(function, copies, args)
+        repeated = _call_or_catch(name, function, copies, args)
         takes_one = _shape_of(single) == expected[-1:]
         differs = takes_one and _shape_of(repeated) != expected
     if differs:
@@ -169,14 +169,19 @@ def _is_conclusive(x: Array) -> bool:
 
 
 def _call_or_catch(
-    function: Callable[..., ArrayLike], states: Sequence[Array], args: tuple[float, ...]
+    name: str,
+    function: Callable[..., ArrayLike],
+    states: Sequence[Array],
+    args: tuple[float, ...],
 ) -> Result:
     """Return a function's result as an array, or the error that it raises."""
     copies: Iterable[Array] = (states[0].copy(),)
     if len(states) > 1:
         copies = [state.copy() for state in states]
     try:
-        return np.asarray(call_user(function, *copies, *args), dtype=np.float64)
+        result = call_user(function, *copies, *args)
+        refuse_mask(result, name)
+        return np.asarray(result, dtype=np.float64)
     except (TypeError, ValueError, IndexError) as error:
         return error
 

@@ -7,6 +7,7 @@ import math
 import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import date, timedelta
 from types import EllipsisType
 from typing import TypeAlias
 
@@ -151,6 +152,7 @@ def all_finite(value: Array) -> bool:
 def _convert_to_float64(value: object, name: str) -> Array:
     """Convert a value that holds real numbers and nothing else."""
     wrong_type = type_name(value)
+    culprit = value
     try:
         # The entries of a list are checked before numpy converts them to a common type.
         parts = value if isinstance(value, list | tuple) else (value,)
@@ -158,20 +160,59 @@ def _convert_to_float64(value: object, name: str) -> Array:
         # An array of objects may hold numbers, and anything else.
         entries = list(array.ravel()) if array.dtype.kind == "O" else []
         if entries:
-            wrong_type = type_name(entries[0])
+            culprit = entries[0]
+            wrong_type = type_name(culprit)
         # Booleans, text and dates would be converted to numbers without an error.
         refused = [v for v in (*parts, *entries) if isinstance(v, _NOT_REAL)]
         if refused:
-            wrong_type = type_name(refused[0])
+            culprit = refused[0]
+            wrong_type = type_name(culprit)
         elif array.dtype.kind in "fiuO":
             return np.asarray(array, dtype=np.float64)
         else:
-            wrong_type = array.dtype.name
+            culprit = array
+            # numpy calls a text of four letters str128.
+            is_text = array.dtype.kind == "U"
+            wrong_type = "str" if is_text else array.dtype.name
     except (TypeError, ValueError, OverflowError):
         pass  # numpy could not convert it: refused below by its type
     raise InvalidArgumentError(
         f"{name} must be an array of real numbers, got {wrong_type}"
+        f"{'' if value is None else describe_conversion(culprit)}"
     ) from None
+
+
+def describe_conversion(value: object) -> str:
+    """Return how to turn a value of a wrong type into numbers; nothing where that is not known.
+
+    >>> describe_conversion(None), describe_conversion("1")
+    (': a missing number is NaN', '')
+    >>> describe_conversion(np.datetime64("2024-03-10"))
+    ': give seconds since the start, (x - start) / np.timedelta64(1, "s")'
+    """
+    if value is None:
+        return ": a missing number is NaN"
+    if isinstance(value, np.ma.MaskedArray):
+        return ": give x.filled(np.nan), a missing number is NaN"
+    kind = value.dtype.kind if isinstance(value, np.ndarray | np.generic) else ""
+    if kind == "m" or isinstance(value, timedelta):
+        return ': give seconds, x / np.timedelta64(1, "s")'
+    if kind == "M" or isinstance(value, date):
+        return ': give seconds since the start, (x - start) / np.timedelta64(1, "s")'
+    return ""
+
+
+def refuse_mask(value: object, name: str) -> None:
+    """Refuse a masked array that a user's function returns; as an array it would lose its mask.
+
+    >>> refuse_mask(np.ma.masked_array([1.0]), "h")
+    Traceback (most recent call last):
+    distfilt.validation.InvalidArgumentError: h must return numbers, got MaskedArray: ...
+    """
+    if isinstance(value, np.ma.MaskedArray):
+        raise InvalidArgumentError(
+            f"{name} must return numbers, got {type_name(value)}{describe_conversion(value)}"
+        )
 
 
 def match_shape(
@@ -212,10 +253,15 @@ def describe_misshape(shape: tuple[int, ...], expected: Shape) -> str:
 
     >>> describe_misshape((2, 1), (2,)), describe_misshape((), (..., 1))
     (': a column, give x[:, 0]', ': give [x], an array of one number')
+    >>> describe_misshape((), (1, 1)), describe_misshape((1,), (1, 1))
+    (': give [[x]], a matrix of one number', ': give [x], a matrix of one number')
     """
     size = expected[-1] if expected else None
     if shape[-1:] == (1,) and len(shape) > 1 and shape[-2] == size != 1:
         return ": a column, give x[:, 0]"
+    if expected[-2:] == (1, 1) and shape in ((), (1,)):
+        given = "[x]" if shape else "[[x]]"
+        return f": give {given}, a matrix of one number"
     if shape == () and size == 1:
         return ": give [x], an array of one number"
     return ""
@@ -305,7 +351,7 @@ def _has_cholesky(value: Array) -> bool:
     """Whether all matrices of a stack have a Cholesky factor."""
     if value.ndim == 2 and value.size:
         # LAPACK itself takes a fifth of numpy's time for one matrix.
-        failed = dpotrf(value, lower=1)[1]
+        _factor, failed = dpotrf(value, lower=1)
         if not failed:
             return True
     with contextlib.suppress(np.linalg.LinAlgError):

@@ -9,13 +9,50 @@ import numpy as np
 
 from .checks import Array, format_number
 
-__all__ = ["warn_of_clock"]
+__all__ = ["warn_of_clock", "warn_of_unit"]
 
 _LONG = 1e8
 """A first step of more than three years, in s."""
 
 _LONG_STEPS = 1e5
 """A first step that is longer than the others by more than this factor."""
+
+
+_LONGEST = 1e11
+"""Times beyond three thousand years, in s, are in another unit."""
+
+
+def warn_of_unit(t: float, name: str) -> None:
+    """Warn if a time is so large that it must be in another unit than seconds.
+
+    Parameters
+    ----------
+    t : float
+        The time.
+    name : str
+        The argument's name.
+
+    Examples
+    --------
+    >>> with warnings.catch_warnings(action="error"):
+    ...     warn_of_unit(1.7e18, "t")
+    Traceback (most recent call last):
+    RuntimeWarning: t must be in seconds, got 1.7e+18, which a Unix time in nanoseconds would be
+    >>> warn_of_unit(1.7e9, "t")
+    """
+    size = abs(t)
+    if size < _LONGEST:
+        return
+    unit = "nanoseconds"
+    if size < 1e14:
+        unit = "milliseconds"
+    elif size < 1e17:
+        unit = "microseconds"
+    warnings.warn(
+        f"{name} must be in seconds, got {format_number(t)}, which a Unix time in {unit} would be",
+        RuntimeWarning,
+        stacklevel=4,
+    )
 
 
 def warn_of_clock(start: float, times: Array, name: str) -> None:

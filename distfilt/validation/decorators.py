@@ -12,7 +12,7 @@ from dataclasses import Field, fields
 from functools import cache, cached_property, partial, wraps
 from inspect import Parameter, get_annotations, signature
 from math import isfinite
-from typing import TYPE_CHECKING, ClassVar, Self, TypeVar, cast
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, Self, TypeVar, cast
 
 import numpy as np
 
@@ -336,7 +336,7 @@ class FrozenModel:
         # Past __init__, and so past the checks.
         instance = object.__new__(cls)
         dataclass = cast(Hashable, cls)
-        names, factories = _fields(dataclass)
+        names, factories = _list_fields(dataclass)
         values = vars(instance)
         values.update(zip(names, args, strict=False), **options)
         for name, factory in factories:
@@ -347,20 +347,24 @@ class FrozenModel:
     def replace(self, **changes: object) -> Self:
         """Return a copy with other values in some fields, unchecked."""
         cls = cast(Hashable, type(self))
-        names, _ = _fields(cls)
-        values = {name: getattr(self, name) for name in names}
+        values = {name: getattr(self, name) for name in _list_fields(cls).names}
         return self.construct(**values | changes)
 
 
-@cache
-def _fields(
-    cls: type[FrozenModel],
-) -> tuple[tuple[str, ...], tuple[tuple[str, Callable[[], object]], ...]]:
-    """Return the names of a dataclass's fields, and (name, factory) of those with a factory.
+class _FieldList(NamedTuple):
+    """The names of a dataclass's fields, and (name, factory) of those with a factory.
 
     A factory makes a field's default, anew for each instance. A default that is no factory is an
     attribute of the class, so that instances need none.
     """
+
+    names: tuple[str, ...]
+    factories: tuple[tuple[str, Callable[[], object]], ...]
+
+
+@cache
+def _list_fields(cls: type[FrozenModel]) -> _FieldList:
+    """Return the fields of a dataclass, in the order of its constructor."""
     names = []
     factories = []
     for item in fields(cls):
@@ -368,7 +372,7 @@ def _fields(
         # In a class that was sent to another process, "none" is a copy of MISSING.
         if callable(item.default_factory):
             factories.append((item.name, item.default_factory))
-    return tuple(names), tuple(factories)
+    return _FieldList(tuple(names), tuple(factories))
 
 
 @cache
@@ -378,7 +382,7 @@ def field_constraints(cls: type[FrozenModel]) -> dict[str, ArgumentConstraint]:
     Those of arrays are last, as their shapes may refer to other fields.
     """
     dataclass = cast(Hashable, cls)
-    names, _ = _fields(dataclass)
+    names = _list_fields(dataclass).names
     constraints: dict[str, ArgumentConstraint] = {}
     # Base classes first, so that a subclass may narrow the annotation of a field.
     for base in reversed(cls.__mro__):

@@ -11,15 +11,18 @@ import base64
 import io
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import nbformat
 import numpy as np
+import psutil
 import pytest
 from PIL import Image
 
@@ -67,6 +70,34 @@ def execution(executed_folder: Path) -> subprocess.CompletedProcess[str]:
         # A rejected chapter must leave this file alone.
         path.with_suffix(".ipynb").write_text("as it was")
     return tool("execute.py", *sources)
+
+
+@pytest.mark.parametrize("name", ["execute.py", "regress.py"])
+def test_a_time_limit_leaves_no_process(
+    name: str, executed: Path, folder: Path
+) -> None:
+    # A cell that would run for ten minutes, and a mark that it runs
+    started = folder / "started"
+    cell = (
+        f"import pathlib, time\npathlib.Path({str(started)!r}).touch()\ntime.sleep(600)"
+    )
+    header = (executed / "small.md").read_text(encoding="utf-8").split("```")[0]
+    page = folder / "endless.md"
+    page.write_text(f"{header}```{{code-cell}} ipython3\n{cell}\n```\n")
+    notebook = execute.read(page)
+    nbformat.write(notebook, page.with_suffix(".ipynb"))
+    process = subprocess.Popen(
+        [sys.executable, TOOLS / name, page], cwd=ROOT, stdout=subprocess.DEVNULL
+    )
+    deadline = time.monotonic() + 120
+    while not started.exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    children = psutil.Process(process.pid).children(recursive=True)
+    assert children
+    process.terminate()
+    assert process.wait(timeout=60) == 128 + signal.SIGTERM
+    _, alive = psutil.wait_procs(children, timeout=30)
+    assert not alive
 
 
 @pytest.fixture(scope="module")

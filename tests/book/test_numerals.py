@@ -1,4 +1,4 @@
-"""The tool that traces numerals: wrong ones are found, right ones have their source."""
+"""The tool that looks for numerals: right ones are shown, wrong ones are found."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import pytest
 import numerals
 from execute import read
 
-CODE = '''n_members = 40
+CODE = """n_members = 40
 gain = 0.25
-print("error 3.62 m, failed 7% of runs, evidence 1.7e-06")
-assert gain < 0.5, "two thirds of the members agree"'''
+agreeing = 2 / 3
+print("error 3.62 m, failed 7% of runs, evidence 1.7e-06")"""
 PAGE = """# A page
 
 A filter with {members} members has a gain of {gain}. {share} of the members agree.
@@ -48,8 +48,8 @@ RIGHT = {
 DIGEST = "axes 1: 1 line\nline 1 y: 9 values, 1.852..77.4, mean 20.3, projection 55.55"
 
 
-def untraced(folder: Path, **changes: str) -> list[str]:
-    """Return the numerals without a source of the page, with some of them changed."""
+def unseen(folder: Path, **changes: str) -> list[str]:
+    """Return the numerals of the page that are shown nowhere, with some of them changed."""
     source = folder / "page.md"
     source.write_text(PAGE.format(code=CODE, **RIGHT | changes), encoding="utf-8")
     notebook = read(source)
@@ -61,13 +61,14 @@ def untraced(folder: Path, **changes: str) -> list[str]:
         nbformat.v4.new_output("display_data", data=picture),
     ]
     nbformat.write(notebook, source.with_suffix(".ipynb"))
-    found, facts = numerals.read_chapter(source)
-    sources = [n.source or numerals.trace(n, numerals.Facts(facts)) for n in found]
+    found, shown = numerals.read_chapter(source)
+    numbers = numerals.Numbers(shown)
+    sources = [n.source or numbers.source_of(n) for n in found]
     return [n.text for n, text in zip(found, sources, strict=True) if not text]
 
 
-def test_every_right_numeral_has_a_source(tmp_path: Path) -> None:
-    assert untraced(tmp_path) == []
+def test_every_right_numeral_is_shown(tmp_path: Path) -> None:
+    assert unseen(tmp_path) == []
 
 
 @pytest.mark.parametrize(
@@ -85,7 +86,49 @@ def test_every_right_numeral_has_a_source(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_numeral_is_found(tmp_path: Path, name: str, wrong: str) -> None:
-    assert len(untraced(tmp_path, **{name: wrong})) == 1
+    assert len(unseen(tmp_path, **{name: wrong})) == 1
+
+
+SECTIONS = """# A page
+
+(sec-runs)=
+## Runs
+
+```{code-cell} ipython3
+n_runs = 48
+start = 0.37
+```
+
+## Results
+
+{sentence}
+"""
+
+
+@pytest.mark.parametrize(
+    ("sentence", "expected"),
+    [
+        # A number of another section needs its name, or the section's.
+        ("The error is 0.37 m.", ["0.37"]),
+        ("The start is 0.37 m.", []),
+        ("By {ref}`the runs <sec-runs>` the error is 0.37 m.", []),
+        ("It is 48 in all.", ["48"]),
+        ("There are 48 runs.", []),
+        # A formula is worked out, whatever the cells show.
+        ("It is $6\\cdot7=42$.", []),
+        ("It is $6\\cdot7=43$.", ["43"]),
+    ],
+)
+def test_a_number_belongs_to_its_section(
+    tmp_path: Path, sentence: str, expected: list[str]
+) -> None:
+    source = tmp_path / "page.md"
+    source.write_text(SECTIONS.replace("{sentence}", sentence), encoding="utf-8")
+    nbformat.write(read(source), source.with_suffix(".ipynb"))
+    found, shown = numerals.read_chapter(source)
+    numbers = numerals.Numbers(shown)
+    sources = [n.source or numbers.source_of(n) for n in found]
+    assert [n.text for n, s in zip(found, sources, strict=True) if not s] == expected
 
 
 @pytest.mark.parametrize(

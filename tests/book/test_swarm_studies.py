@@ -11,6 +11,7 @@ from distfilt.network import Channel, graphs, pi_start, pi_step
 densities = studies.script("densities")
 tenfold = studies.script("tenfold")
 figure = studies.script("locals")
+swarm_views = studies.script("_swarm_views")
 ROOM = densities.grid()
 
 
@@ -111,3 +112,17 @@ def test_diverged_estimates_stay_as_they_are() -> None:
     # Without messages an estimate decays to its own input at the rate α.
     decay = 1 - tenfold.DT * tenfold.swarm.PAPERS["alpha"]
     assert np.allclose(advanced["silent"][0], decay)
+
+
+def test_views_are_those_of_the_first_stored_run() -> None:
+    stored = studies.stored("zheng", "locals")
+    views, errors = swarm_views.repeat_first_run(agent=2, every=20, seconds=4.0)
+    assert list(views) == ["0", "2", "4"]
+    for name, line in zip(("kde", "central", "paper_2"), errors, strict=True):
+        for t in (2, 4):
+            expected = stored.metric(f"{name}_at_{t}")[0]
+            assert np.isclose(line[round(t / 0.1) - 1], expected, rtol=figure.rtol)
+    # The last view is what the last errors were computed from.
+    _, density, centralised, local = views["4"]
+    distances = ROOM.norm(np.stack([centralised, local]) - density)
+    assert np.allclose(distances, errors[1:, -1])

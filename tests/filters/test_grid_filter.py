@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -316,3 +317,20 @@ def test_a_grid_that_is_too_coarse_or_elsewhere() -> None:
         (ValueError, FilterError), match="grid must have cells no wider"
     ):
         f.step(f.start(PRIOR), 1.0, [None])
+
+
+def test_a_belief_at_the_edge_of_the_box_is_told_once() -> None:
+    """A state beyond the box, as of a robot off its map (beluga issue 420)."""
+    eye = component([0], std=0.5)
+    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    f = GridFilter(still, [eye], grid=Grid((60,), low=-6.0, high=6.0))
+    state = f.start(([0.0], [[4.0]]))
+    with pytest.warns(RuntimeWarning, match="is in the outermost cells") as caught:
+        state = f.step(state, 1.0, [[20.0]])
+        state = f.step(state, 2.0, [[20.5]])
+    assert len(caught) == 1
+    # Within the box nothing is said, nor on grids that have few cells.
+    with warnings.catch_warnings(action="error"):
+        f.step(f.start(([0.0], [[4.0]])), 1.0, [[5.0]])
+        few = GridFilter(still, [eye], grid=Grid((4,), low=-6.0, high=6.0))
+        few.step(few.start(([0.0], [[4.0]])), 1.0, [[5.0]])

@@ -224,3 +224,26 @@ def test_extended_steps_are_the_linearised_formulas(
     mean, cov = condition(x, p, innovation, h, FULL)
     np.testing.assert_allclose(run.means[1], mean, atol=1e-7)
     np.testing.assert_allclose(run.covariances[1], cov, atol=1e-7)
+
+
+@pytest.mark.parametrize("run", [filterpy_ekf, filterpy_ukf])
+def test_degrees_are_told_and_what_cannot_be_seen_is_named(run: Any) -> None:
+    still = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
+    prior = ([10.0, 10.0], 0.1 * np.eye(2))
+    compass = bearing([0, 1], std=0.1)
+    with pytest.warns(
+        RuntimeWarning, match="must be angles in rad, got some 7 turns off"
+    ):
+        run(*prior, [[45.3]], model=still, sensors=[compass], times=[1.0])
+    near = Sensor(1, lambda x: np.where(x[..., :1] < 5, x[..., :1], np.nan), [[0.1]])
+    with pytest.raises(ValueError, match="but a sensor cannot see at t = 1 s"):
+        run(*prior, [[4.0]], model=still, sensors=[near], times=[1.0])
+    # Of two sensors the other one is enough, if nothing comes from the blind one.
+    both = run(
+        *prior,
+        [[np.nan, 10.5]],
+        model=still,
+        sensors=[near, component([0], std=0.1)],
+        times=[1.0],
+    )
+    assert np.isclose(both.means[0, 0], 10 + 0.5 * 0.1 / 0.11)

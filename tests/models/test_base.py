@@ -251,3 +251,9 @@ def test_shipped_models_can_be_pickled(name: str) -> None:
     assert (copy.step(x, 0.0, 0.2) == model.step(x, 0.0, 0.2)).all()
     assert (copy.jacobian(x, 0.0, 0.2) == model.jacobian(x, 0.0, 0.2)).all()
     assert (copy.Q(0.0, 0.2) == model.Q(0.0, 0.2)).all()
+
+
+def test_names_are_different() -> None:
+    """Two of one name could not be told apart in a record, a reset or a truth."""
+    with pytest.raises(ValueError, match=r"names must be different, got \['x', 'x'\]"):
+        Model(2, lambda x, t, dt: x, lambda t, dt: np.eye(2), names=("x", "x"))

@@ -8,6 +8,9 @@
 | ApolloAuto/apollo 5304 | 359° predicted, 1° measured: a period of 360 |
 | manankharwar/fusioncore 92 | points of the prediction straddle the cut |
 | PointCloudLibrary/pcl 5538 | the mean of particles whose rotations straddle the cut |
+| mathnet/mathnet-filtering pull 27 | members and mixtures of a prior on both sides of the cut |
+| rlabbe/Kalman-and-Bayesian-Filters-in-Python 407 | components that part and meet |
+| PX4/PX4-Autopilot pull 21287 | a likelihood of a heading, and a gate beside it |
 | own | a prior wider than the circle; increments; delayed observations; truth with a cut |
 
 Right values are those of the same problem turned away from the cut, or of scalar formulas.
@@ -25,7 +28,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from distfilt import network
+from distfilt import filters, network
 from distfilt.filters import (
     EnsembleFilter,
     GaussianFilter,
@@ -40,6 +43,7 @@ from distfilt.mixtures import GaussianMixture, target_fusion
 from distfilt.models import LinearModel, Model, pendulum_angle
 from distfilt.network import Channel, graphs
 from distfilt.sensors import (
+    LikelihoodSensor,
     Sensor,
     bearing,
     component,
@@ -773,3 +777,143 @@ def test_the_page_s_example() -> None:
     printed: list[tuple[Any, ...]] = []
     exec(code, {"print": lambda *values: printed.append(values)})
     assert [bool(value) for value in printed[0]] == [True, True]
+
+
+def start_and_look(make: Any, prior: Any) -> tuple[float, float]:
+    """Return mean and variance of a heading after a compass shows 6.2 ± 0.2 rad."""
+    compass = component([0], std=0.2, periods=(TURN,))
+    resting = Model(
+        1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)), periods=(TURN,)
+    )
+    f = make(resting, [compass])
+    state = f.step(f.start(prior, rng=np.random.default_rng(0)), 0.0, [[6.2]])
+    summary = f.summarize(state)
+    return float(summary.mean[0, 0]), float(summary.variance[0, 0])
+
+
+PRIOR_FAMILIES: dict[str, Any] = {
+    "gaussian": GaussianFilter,
+    "unscented": partial(GaussianFilter, linearization="unscented"),
+    "sum": filters.GaussianSumFilter,
+    "mixture": partial(MixtureFilter, target_dim=1),
+    "information": partial(
+        filters.InformationConsensusFilter,
+        graph=graphs.complete(1),
+        fusion=network.average_consensus,
+    ),
+    "channel": partial(filters.ChannelFilter, graph=graphs.path(1)),
+    "ensemble": partial(EnsembleFilter, members=4000),
+    "particle": partial(ParticleFilter, members=4000),
+    "transport": partial(TransportFilter, graph=graphs.complete(1), members=300),
+    "increments": partial(
+        filters.InformationIncrementFilter, graph=graphs.complete(1), target_dim=1
+    ),
+}
+
+
+@pytest.mark.parametrize("family", PRIOR_FAMILIES)
+def test_members_of_a_prior_between_zero_and_two_pi(family: str) -> None:
+    """Headings 0 ± 0.3 rad, as a file in [0, 2π) has them: about 0, not about π."""
+    make = PRIOR_FAMILIES[family]
+    count = make.keywords.get("members", 2000) if isinstance(make, partial) else 2000
+    members = np.random.default_rng(1).normal(0.0, 0.3, (count, 1)) % TURN
+    # 1/P = 1/.09 + 1/.04, and the mean is P (6.2 - 2π) / .04
+    variance = 1 / (1 / 0.09 + 1 / 0.04)
+    mean = variance * (6.2 - TURN) / 0.04
+    got = start_and_look(make, members)
+    tolerance = 0.04 if family == "transport" else 0.015
+    assert np.allclose(got, (mean, variance), atol=tolerance)
+
+
+@pytest.mark.parametrize("family", PRIOR_FAMILIES)
+def test_a_mixture_of_a_prior_on_both_sides(family: str) -> None:
+    """Two components at 6.1 and 0.1 rad, as at -0.18 and 0.1 on one branch."""
+    components = [[6.1], [0.1]]
+    covs = [[[0.01]], [[0.01]]]
+    torn = GaussianMixture([0.5, 0.5], components, covs)
+    whole = GaussianMixture([0.5, 0.5], [[6.1 - TURN], [0.1]], covs)
+    make = PRIOR_FAMILIES[family]
+    tolerance = 1e-9 if "members" not in getattr(make, "keywords", {}) else 0.02
+    expected = start_and_look(make, whole)
+    assert np.allclose(start_and_look(make, torn), expected, atol=tolerance)
+
+
+def test_components_of_a_sum_that_part_lie_on_one_branch() -> None:
+    """One turns left, the other right: they meet at π, and the variance is small again."""
+    turning = Model(
+        2,
+        lambda x, t, dt: np.stack([x[..., 0] + x[..., 1] * dt, x[..., 1]], axis=-1),
+        lambda t, dt: np.zeros((2, 2)),
+        periods={0: TURN},
+    )
+    f = filters.GaussianSumFilter(turning, [None])
+    covs = np.array([np.diag([0.01, 1e-6])] * 2)
+    prior = GaussianMixture([0.5, 0.5], [[0.0, 1.0], [0.0, -1.0]], covs)
+    state = f.step(f.start(prior), np.pi, [None])
+    variance = f.summarize(state).variance[0, 0]
+    assert np.isclose(variance, 0.01 + 1e-6 * np.pi**2, atol=1e-9)
+
+
+def log_von_mises(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return 25 * np.cos(y - x)[..., 0]
+
+
+def von_mises_moments(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return x, np.full((*x.shape, 1), 0.04)
+
+
+LIKELIHOOD_FAMILIES: dict[str, Any] = {
+    "particle": partial(ParticleFilter, members=20_000),
+    "transport": partial(TransportFilter, graph=graphs.complete(1), members=400),
+    "likelihood": partial(
+        filters.LikelihoodConsensusFilter,
+        graph=graphs.complete(1),
+        members=20_000,
+        basis=filters.PolynomialBasis([0]),
+        fusion=network.average_consensus,
+    ),
+}
+
+
+@pytest.mark.parametrize("gate", [None, 0.999])
+@pytest.mark.parametrize("with_moments", [True, False])
+@pytest.mark.parametrize("family", LIKELIHOOD_FAMILIES)
+def test_a_likelihood_of_a_heading(family: str, with_moments: bool, gate: Any) -> None:
+    """A von Mises compass on the other side of the cut, against a sum on a grid."""
+    if gate is not None and not with_moments:
+        pytest.skip("a gate needs moments")
+    compass = LikelihoodSensor(
+        1,
+        log_von_mises,
+        moments=von_mises_moments if with_moments else None,
+        periods=(TURN,),
+    )
+    resting = Model(
+        1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)), periods=(TURN,)
+    )
+    f = LIKELIHOOD_FAMILIES[family](resting, [compass], gate_probability=gate)
+    start = f.start(([3.0], [[0.09]]), rng=np.random.default_rng(1))
+    summary = f.summarize(f.step(start, 0.0, [[-3.0]]))
+    grid = np.linspace(0.0, TURN, 20_001)
+    density = np.exp(-((grid - 3.0) ** 2) / 0.18 + 25 * np.cos(grid + 3.0))
+    density /= density.sum()
+    mean = density @ grid
+    variance = density @ (grid - mean) ** 2
+    got = float(summary.mean[0, 0]) % TURN, float(summary.variance[0, 0])
+    assert np.allclose(
+        got, (mean, variance), atol=0.04 if family == "transport" else 0.01
+    )
+
+
+@pytest.mark.parametrize("family", LIKELIHOOD_FAMILIES)
+def test_a_likelihood_that_does_not_wrap_is_refused(family: str) -> None:
+    straight = LikelihoodSensor(1, lambda x, y: -50 * (y - x)[..., 0] ** 2)
+    resting = Model(
+        1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)), periods=(TURN,)
+    )
+    f = LIKELIHOOD_FAMILIES[family](resting, [straight])
+    start = f.start(([3.0], [[0.09]]), rng=np.random.default_rng(1))
+    with pytest.raises(
+        ValueError, match="must have the same log_likelihood for the same"
+    ):
+        f.step(start, 0.0, [[-3.0]])

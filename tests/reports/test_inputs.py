@@ -4,6 +4,7 @@
 |---|---|---|
 | own | the noise of a robot's wheels, along its heading | Jacobian by hand, and draws |
 | own | odometry at another rate than the filter's steps | pieces by hand |
+| ros-controls/ros2_controllers pull 1454 | a log that ends: the last speed is held | warned of |
 
 Covariances are G Σ Gᵀ written out for a robot on the plane, and sample covariances of draws.
 """
@@ -83,7 +84,7 @@ def test_steps_across_inputs_use_each_for_its_time() -> None:
     for start, length, values in (
         (0.0, 1.0, [1.0, 0.2]),
         (1.0, 1.0, [2.0, -0.1]),
-        (9.0, 5.0, [0.5, 0.0]),
+        (3.0, 5.0, [0.5, 0.0]),
     ):
         ((_, _, u),) = ODOMETRY.pieces(start, length)
         assert u.tolist() == values
@@ -164,3 +165,21 @@ def test_what_needs_one_covariance_refuses_it_by_name() -> None:
         Inputs([1.0], [[0.0]], [[1.0]]).pieces(0.0, 1.0)
     with pytest.raises(ValueError, match=r"values must have shape \(2, k\)"):
         Inputs([0.0, 1.0], [[0.0]], [[1.0]])
+
+
+def test_inputs_that_end_are_told_once() -> None:
+    """Up to ten times the longest interval the last one is held without a word."""
+    log = Inputs([0.0, 1.0, 2.0], [[1.0], [1.0], [1.0]], [[0.01]])
+    line = InputModel.from_inputs(1, lambda x, u, dt: x + dt * u, log)
+    f = filters.GaussianFilter(line, [None])
+    state = f.step(f.start(([0.0], [[1.0]])), 12.0, [None])
+    assert np.allclose(state.means, 12.0)
+    with pytest.warns(RuntimeWarning, match="a step's end at 13, got 2 last") as caught:
+        state = f.step(state, 13.0, [None])
+        f.step(state, 500.0, [None])
+    assert len(caught) == 1
+    # A single input holds for ever.
+    wind = Inputs([0.0], [[1.0]], [[0.01]])
+    steady = InputModel.from_inputs(1, lambda x, u, dt: x + dt * u, wind)
+    g = filters.GaussianFilter(steady, [None])
+    assert np.allclose(g.step(g.start(([0.0], [[1.0]])), 500.0, [None]).means, 500.0)

@@ -6,6 +6,8 @@
 | own | the same in `kalman_filter` and its smoother | equals the state without it |
 | own | agents that share such a constant, by every rule of fusion | equals the state without it |
 | own | ensembles that share it, by intersection | equals the ensembles without it |
+| equinor/ert 9581, helske/bssm 5 | a constant in an ensemble that a map moves | as without it |
+| CliMA/EnsembleKalmanProcesses.jl 517 | components that others determine | they follow |
 
 A bias b that is known to be 0.5 adds to the observation; without it 0.5 is subtracted beforehand.
 """
@@ -23,6 +25,8 @@ from distfilt.kalman import kalman_filter, rts_smoother
 from distfilt.models import LinearModel, Model
 from distfilt.network import Channel, graphs
 from distfilt.sensors import Sensor, component
+from distfilt.triangular import separable
+from distfilt.updates import transport_map_update
 
 BIAS = 0.5
 PRIOR = (np.array([1.0, -0.5]), np.array([[1.0, 0.3], [0.3, 0.8]]))
@@ -237,3 +241,59 @@ def test_networks_of_exact_ensembles_know_a_constant() -> None:
     expected = g.run(start, TIMES, [SEEN + BIAS] * 2)
     assert np.allclose(run["mean"].values, expected["mean"].values, atol=1e-8)
     assert np.allclose(run["variance"].values, expected["variance"].values, atol=1e-8)
+
+
+MAPS: dict[str, Any] = {
+    "affine": transport_map_update,
+    "separable": partial(transport_map_update, fit=partial(separable.fit, order=1)),
+}
+
+
+@pytest.mark.parametrize("units", [1.0, 1e-9, 1e9])
+@pytest.mark.parametrize("name", MAPS)
+def test_maps_leave_constants_and_move_what_is_determined(
+    name: str, units: float
+) -> None:
+    """Beside x: 7, and 3 x - 1, which stay 7 and 3 x' - 1. Alone x moves as before."""
+    rng = np.random.default_rng(1)
+    x = rng.standard_normal((300, 2))
+    seven = np.full(300, 7.0)
+    long = np.c_[seven, x[:, 0], units * (3 * x[:, 0] - 1), x[:, 1]]
+    update = partial(MAPS[name], predicted=x[:, :1], observed=[1.0], noise=[[0.5]])
+    short = update(ensemble=x, rng=np.random.default_rng(2))
+    moved = update(ensemble=long, rng=np.random.default_rng(2))
+    assert (moved[:, 0] == 7.0).all()
+    assert np.allclose(moved[:, [1, 3]], short, atol=1e-9)
+    assert np.allclose(moved[:, 2] / units, 3 * short[:, 0] - 1, atol=1e-8)
+    # In a stack too
+    both = np.stack([long, long[::-1]])
+    update = partial(MAPS[name], observed=[1.0], noise=[[0.5]])
+    stack = update(both, both[..., 1:2], rng=np.random.default_rng(2))
+    assert (stack[..., 0] == 7.0).all()
+
+
+@pytest.mark.parametrize("name", MAPS)
+@pytest.mark.parametrize("lag", [0, 2])
+def test_ensembles_with_maps_know_a_constant(name: str, lag: int) -> None:
+    """At rest and with a lag, earlier states are copies of the present one."""
+    rest = LinearModel.from_transition(
+        3, lambda dt: np.eye(3), lambda t, dt: np.zeros((3, 3))
+    )
+    f = filters.EnsembleFilter(
+        rest, [LINEAR_BIASED], update=MAPS[name], members=4000, lag=lag
+    )
+    state = f.start(WITH_BIAS, rng=np.random.default_rng(0))
+    state = f.step(f.step(state, 1.0, [None]), 2.0, [[1.5]])
+    summary = f.summarize(state)
+    # As the Kalman filter without the bias: S = 1 + .4, of an observation of 1
+    assert np.allclose(summary.mean[0], [1.0, -0.5, BIAS], atol=0.05)
+    assert np.isclose(summary.variance[0, 0], 1 - 1 / 1.4, atol=0.03)
+    assert summary.variance[0, 2] < 1e-20
+
+
+def test_a_map_without_anything_to_move() -> None:
+    y = np.random.default_rng(0).standard_normal((9, 1))
+    after = transport_map_update(
+        np.ones((9, 2)), y, [0.0], [[1.0]], rng=np.random.default_rng(1)
+    )
+    assert (after == 1.0).all()

@@ -8,6 +8,8 @@
 | own | a count beside a Gaussian sensor, sent to a neighbour | weights by hand |
 | own | such a sensor in a Kalman filter | refused by name |
 | own | the nis of a sensor without moments | unknown (NaN), and its numbers count |
+| NAU-CCL/Epymorph 237 | one of two components is missing | weights of the other, or refused |
+| mrc-ide/mcstate 75 | the likelihood in place of its logarithm | warned of once |
 
 Posteriors are integrals on a fine grid; weights are products of densities of scipy.
 """
@@ -22,7 +24,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm, poisson, t
 
-from distfilt import filters
+from distfilt import density, filters, network
 from distfilt.filters import Observation, ParticleFilter, TransportFilter
 from distfilt.models import LinearModel
 from distfilt.network import graphs
@@ -315,3 +317,90 @@ def test_draws_and_predictions_are_its_own() -> None:
     assert abs(drawn.mean() - np.e) < 0.05
     assert abs(drawn.var() - np.e) < 0.15
     assert np.allclose(COUNTER.predict([[0.0], [1.0]]), [[1.0], [np.e]])
+
+
+def log_both(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Two components with the deviation 0.5; one that is missing has no share."""
+    return norm.logpdf(y, x, 0.5).sum(axis=-1)
+
+
+def log_either(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.nansum(norm.logpdf(y, x, 0.5), axis=-1)
+
+
+def both_moments(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return x, np.broadcast_to(0.25 * np.eye(2), (*x.shape, 2)).copy()
+
+
+PLANE = LinearModel.from_transition(
+    2, lambda dt: np.eye(2), lambda t, dt: np.zeros((2, 2))
+)
+WIDE = (np.zeros(2), np.array([[1.0, 0.3], [0.3, 0.8]]))
+PARTLY: dict[str, Any] = {
+    "particle": partial(ParticleFilter, members=20_000),
+    "transport": partial(TransportFilter, members=500),
+    "likelihood": partial(
+        filters.LikelihoodConsensusFilter,
+        members=20_000,
+        basis=filters.PolynomialBasis([0, 1]),
+        fusion=network.finite_time_consensus,
+    ),
+    "grid": partial(
+        filters.GridFilter, grid=density.Grid((60, 60), low=(-5, -5), high=(5, 5))
+    ),
+}
+
+
+@pytest.mark.parametrize("gate", [None, 0.999])
+@pytest.mark.parametrize("family", PARTLY)
+def test_one_of_two_components_is_missing(family: str, gate: float | None) -> None:
+    """As a Gaussian sensor of the second component, of which a neighbour is told too."""
+    make = PARTLY[family]
+    sensor = LikelihoodSensor(2, log_either, moments=both_moments)
+    f = make(
+        PLANE,
+        [sensor, None],
+        graphs.complete(2),
+        gate_probability=gate,
+        record_evidence=True,
+    )
+    run = f.run(
+        f.start(WIDE, rng=np.random.default_rng(0)), [1.0], [[[np.nan, 1.0]], None]
+    )
+    # S = .8 + .25, K = [.3, .8] / S
+    gain = np.array([0.3, 0.8]) / 1.05
+    mean = run["mean"].values[0]
+    # Five hundred members miss moments by some 0.05.
+    atol = 0.15 if family == "transport" else 0.03
+    assert np.allclose(mean, gain, atol=atol)
+    assert np.isclose(run["nis"][0, 0], 1 / 1.05, atol=atol)
+    assert run["n_observed"][0, 0] == 1
+    expected = norm.logpdf(1.0, scale=np.sqrt(1.05))
+    assert np.isclose(run["log_likelihood"][0, 0], expected, atol=0.05)
+
+
+@pytest.mark.parametrize("family", PARTLY)
+def test_a_likelihood_that_does_not_know_missing_numbers(family: str) -> None:
+    f = PARTLY[family](PLANE, [LikelihoodSensor(2, log_both)], graphs.complete(1))
+    start = f.start(WIDE, rng=np.random.default_rng(0))
+    with pytest.raises(
+        ValueError, match=r"component of the observation is missing \(NaN\)"
+    ):
+        f.step(start, 1.0, [[np.nan, 1.0]])
+
+
+@pytest.mark.parametrize("family", PARTLY)
+def test_a_missing_logarithm_is_told_once(family: str) -> None:
+    wrong = LikelihoodSensor(2, lambda x, y: np.exp(log_both(x, y)))
+    f = PARTLY[family](PLANE, [wrong], graphs.complete(1))
+    state = f.start(WIDE, rng=np.random.default_rng(0))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for t in (1.0, 2.0):
+            state = f.step(state, t, [[0.5, 1.0 + 0.1 * t]])
+    told = ["log_likelihood must return logarithms" in str(w.message) for w in caught]
+    assert sum(told) == 1
+    # Logarithms of high densities are positive, but not for all states.
+    sharp = LikelihoodSensor(2, lambda x, y: norm.logpdf(y, x, 0.05).sum(axis=-1))
+    values = sharp.evaluate(np.random.default_rng(0).normal(size=(500, 2)), [0.0, 0.0])
+    assert values.max() > 0

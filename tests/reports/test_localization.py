@@ -9,6 +9,7 @@
 | gher-uliege/DIVAnd.jl 69 | a coordinate that returns (longitude) beside one that does not |
 | CliMA/ClimaAnalysis.jl 163 | positions on both sides of the cut of the longitude |
 | own | an array of places on a network that is not complete |
+| own | maps, with correlated observations in different places |
 """
 
 from __future__ import annotations
@@ -298,3 +299,21 @@ def test_places_pass_through_other_wrappers() -> None:
         # The earlier time's members are changed at the same places.
         assert np.allclose(state.history[0][1], state.ensembles, atol=1e-12)
     assert np.allclose(*results, atol=1e-12)
+
+
+@pytest.mark.parametrize("correlation", [1e-9, 0.5, -0.9])
+def test_maps_with_correlated_observations_in_different_places(
+    correlation: float,
+) -> None:
+    """An affine map is the update by sample covariances with the same draws."""
+    x = draw(5, 60, 3)
+    places = np.array([[0.0], [1.0], [100.0]])
+    r = 0.25 * np.array([[1.0, correlation], [correlation, 1.0]])
+    results = []
+    for update in (updates.transport_map_update, updates.enkf_sampled_covariance):
+        local = updates.with_localization(
+            update, places=places, observation_places=places[[0, 2]], radius=1.0
+        )
+        rng = np.random.default_rng(0)
+        results.append(local(x, x[:, [0, 2]], [1.0, -1.0], r, rng=rng))
+    assert np.allclose(*results, atol=1e-8)

@@ -10,6 +10,9 @@ own                                 a series (T,) of a sensor of one component
 own                                 a column vector as a mean or an observation
 own                                 a log without a single event
 own                                 noise that is drawn inside the transition
+own                                 Observations alone in a step, in any order
+own                                 an array whose first axes may be times or agents
+simdkalman issue 10                 a missing number as None, numbers as text
 ==================================  ==========================================================
 """
 
@@ -24,6 +27,7 @@ from distfilt.filters import (
     EnsembleFilter,
     GaussianFilter,
     MixtureFilter,
+    Observation,
     ParticleFilter,
     TransportFilter,
     final_state,
@@ -170,3 +174,41 @@ def test_noise_that_is_drawn_inside() -> None:
     sensor = Sensor(1, lambda x: x + rng.normal(size=x.shape), [[1.0]])
     with pytest.raises(ValueError, match="h must give the same values"):
         sensor.predict(np.arange(5.0)[:, None])
+
+
+def test_observations_alone_in_any_order() -> None:
+    f = GaussianFilter(WALK, [EYE, EYE, EYE], graphs.path(3))
+    start = f.start(PRIOR)
+    one, two = Observation(1.0, 2, [1.0]), Observation(1.0, 0, [2.0])
+    expected = f.step(start, 1.0, [[2.0], None, [1.0]])
+    for given in ([one, two], (two, one), [[two], [], [one]]):
+        assert np.array_equal(f.step(start, 1.0, given).means, expected.means)
+    with pytest.raises(ValueError, match="of agents below 3, got 5"):
+        f.step(start, 1.0, [Observation(1.0, 5, [1.0])])
+    with pytest.raises(
+        ValueError, match="an Observation of agent 0 at t = 1, got one of"
+    ):
+        f.step(start, 1.0, [Observation(2.0, 0, [1.0])])
+
+
+def test_an_array_of_as_many_times_as_agents() -> None:
+    """(times, agents, 1) and (agents, times, 1) cannot be told apart."""
+    f = GaussianFilter(WALK, [EYE, EYE], graphs.path(2))
+    y = np.array([[[1.0], [2.0]], [[1.5], [2.5]]])
+    with pytest.raises(ValueError, match=r"give list\(y\), agents first"):
+        f.run(f.start(PRIOR), [1.0, 2.0], y)
+    run = f.run(f.start(PRIOR), [1.0, 2.0], list(y))
+    longer = f.run(
+        f.start(PRIOR), [1.0, 2.0, 3.0], np.concatenate([y, y[:, :1]], axis=1)
+    )
+    assert np.allclose(run["mean"], longer["mean"][:2])
+
+
+def test_numbers_that_are_none_or_text() -> None:
+    f = GaussianFilter(WALK, [component([0, 1], std=1.0)])
+    with pytest.raises(ValueError, match="got NoneType: a missing number is NaN"):
+        f.step(f.start(PRIOR), 1.0, [[None, 1.0]])
+    with pytest.raises(ValueError, match="must be an array of real numbers, got str$"):
+        f.step(f.start(PRIOR), 1.0, [np.array(["1", "2"])])
+    with pytest.raises(ValueError, match=r"give \[\[x\]\], a matrix of one number"):
+        kalman_filter([0.0], [[1.0]], [[1.0]], F=[[1.0]], H=[[1.0]], Q=[[0.1]], R=0.5)

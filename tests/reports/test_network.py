@@ -15,7 +15,12 @@ networkx pull requests 1335,    the direction of an entry of the adjacency matri
 LightGraphs.jl issue 466        a digraph flipped on its way through its adjacency
 libpysal issue 81               an isolated member: one warning says it
 Lomap pull request 154          a network in parts that nobody is told of
+cnfgen pull 107, topologic      labels of a file: numbers as text, in the order of its edges
+pull 60
+fglib issue 8                   belief propagation on a graph with circles
+dynesty issue 263               weights of single precision
 own                             weights that swap values, and diverge; rounds with faults
+own                             diffusion with rows that do not sum to one; edges by names
 ==============================  ==========================================================
 """
 
@@ -36,6 +41,7 @@ from distfilt.models import constant_velocity
 from distfilt.network import Channel, ConsensusWeights, Faults, Graph, graphs, weights
 from distfilt.network.graphs import as_graph
 from distfilt.network.weights import UnstableGain
+from distfilt.sensors import component
 
 Disconnected = network.Disconnected
 RULES: dict[str, Callable[..., Any]] = {
@@ -395,3 +401,77 @@ def test_losses_of_many_rounds_are_drawn_at_once(
     channel.mix(values, weights.metropolis(graph), rounds=400)
     assert sum(calls) == 400
     assert len(calls) <= 2
+
+
+def test_numbers_as_text_are_in_their_order() -> None:
+    """As nodes of a GML or GraphML file are."""
+    graph = nx.Graph([("10", "9"), ("2", "10"), ("9", "1")])
+    assert as_graph(graph).neighbours(3) == (1, 2)
+    words = nx.Graph([("b", "a"), ("a", "c")])
+    assert as_graph(words).neighbours(1) == (0, 2)
+
+
+def test_edges_between_names() -> None:
+    walk = constant_velocity(sigma=0.1, axes=1)
+    eyes = [component([0], std=1.0), None, None]
+    f = GaussianFilter(walk, eyes, [("a", "c")], names=("a", "b", "c"))
+    state = f.step(f.start(([0.0, 0.0], np.eye(2))), 0.0, [[1.0], None, None])
+    assert np.allclose(state.means[:, 0], [0.5, 0.0, 0.5])
+    with pytest.raises(ValueError, match=r"agents \['a', 'b', 'c'\], got 'd'"):
+        GaussianFilter(walk, eyes, [("a", "d")], names=("a", "b", "c"))
+    with pytest.raises(ValueError, match=r"between the agents \[\], got 'a'"):
+        as_graph([("a", "b")], 3)
+
+
+def test_diffusion_needs_rows_that_sum_to_one() -> None:
+    pair = graphs.complete(2)
+    belief = (np.array([[1.0], [1.0]]), np.ones((2, 1, 1)))
+    wrong = ConsensusWeights(pair, [0.5, 0.5], [0.6, 0.6])
+    with pytest.raises(ValueError, match="rows that sum to 1 .* got 1.1 for agent 0"):
+        network.diffuse_means(belief, Channel(pair), weights=wrong)
+    # Rows alone suffice: agents that agree stay as they are.
+    rows = ConsensusWeights(pair, [0.9, 0.5], [0.1, 0.5])
+    means, _ = network.diffuse_means(belief, Channel(pair), weights=rows)
+    assert np.allclose(means, 1.0)
+    other = weights.metropolis(graphs.path(3))
+    with pytest.raises(ValueError, match="weights must"):
+        network.diffuse_means(belief, Channel(pair), weights=other)
+
+
+def test_diffusion_of_angles_keeps_the_weight_of_a_lost_mean() -> None:
+    channel = Channel(graphs.complete(2))
+    channel.periods = (2 * np.pi,)
+    belief = (np.array([[3.1], [-3.1]]), np.ones((2, 1, 1)))
+    with pytest.raises(ValueError, match="on_loss must be 'keep' for circular"):
+        network.diffuse_means(belief, channel, on_loss="renormalise")
+
+
+def test_weights_of_single_precision_say_by_how_much() -> None:
+    pair = graphs.complete(2)
+    single = ConsensusWeights(pair, np.float32([0.9, 0.9]), np.float32([0.1, 0.1]))
+    with pytest.raises(ValueError, match=r"got one that is 2\.\de-08 off"):
+        network.average_consensus(np.ones((2, 1)), Channel(pair), weights=single)
+
+
+@pytest.mark.parametrize("coupling", [0.2, 0.6])
+def test_belief_propagation_in_circles(coupling: float) -> None:
+    """J = 1 + c off the diagonal: the rounds converge for c = .2, and not for .6."""
+    graph = graphs.complete(3)
+    h = np.array([1.0, 2.0, 3.0])
+    couplings = np.full((6, 1, 1), coupling)
+    matrix = coupling * np.ones((3, 3)) + (1 - coupling) * np.eye(3)
+
+    def run(rounds: int) -> np.ndarray:
+        means, _ = network.gaussian_belief_propagation(
+            np.ones((3, 1, 1)), h[:, None], couplings, Channel(graph), rounds=rounds
+        )
+        return means.ravel()
+
+    with pytest.warns(RuntimeWarning, match="enough for the means to converge"):
+        run(1)
+    if coupling < 0.5:
+        with warnings.catch_warnings(action="error"):
+            assert np.allclose(run(40), np.linalg.solve(matrix, h))
+    else:
+        with pytest.warns(RuntimeWarning, match="not converge"):
+            run(60)

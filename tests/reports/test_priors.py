@@ -4,6 +4,7 @@
 |---|---|---|
 | own | robots that know their own starting place best | Kalman filters one by one |
 | own | one agent that starts from a file of members, the others from Gaussians | each its own |
+| own | pairs in a tuple, or as lists of lists, as a file has them | as a list of tuples |
 
 Each agent is compared with a filter of one agent, started from that agent's prior.
 """
@@ -20,7 +21,7 @@ from scipy.stats import multivariate_normal
 from distfilt import filters
 from distfilt.mixtures import GaussianMixture
 from distfilt.models import constant_velocity
-from distfilt.network import graphs
+from distfilt.network import average_consensus, graphs
 from distfilt.sensors import component
 
 MOTION = constant_velocity(sigma=0.3)
@@ -96,3 +97,30 @@ def test_wrong_lists_are_refused_by_name() -> None:
     g = filters.TransportFilter(MOTION, EYES, graphs.path(3), members=10)
     with pytest.raises(ValueError, match="one for all agents of a TransportFilter"):
         g.start(GAUSSIANS, rng=np.random.default_rng(0))
+
+
+FAMILIES: dict[str, Any] = {
+    "gaussian": filters.GaussianFilter,
+    "ensemble": partial(filters.EnsembleFilter, members=20),
+    "particle": partial(filters.ParticleFilter, members=20),
+    "mixture": partial(filters.MixtureFilter, target_dim=4),
+    "increments": partial(filters.InformationIncrementFilter, target_dim=4),
+    "sum": filters.GaussianSumFilter,
+    "information": partial(
+        filters.InformationConsensusFilter, fusion=average_consensus
+    ),
+}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_pairs_in_a_tuple_and_as_lists_of_lists(family: str) -> None:
+    f = FAMILIES[family](MOTION, EYES, graphs.path(3))
+    lists = [[mean.tolist(), cov.tolist()] for mean, cov in GAUSSIANS]
+    rng = partial(np.random.default_rng, 0)
+    expected = f.summarize(f.start(GAUSSIANS, rng=rng())).mean
+    for given in (tuple(GAUSSIANS), lists, tuple(map(tuple, lists))):
+        got = f.summarize(f.start(given, rng=rng())).mean
+        assert np.array_equal(got, expected)
+    # One pair as a list is one prior for all.
+    one = f.summarize(f.start(lists[0], rng=rng())).mean
+    assert np.array_equal(one, f.summarize(f.start(GAUSSIANS[0], rng=rng())).mean)

@@ -8,6 +8,11 @@ robot_localization issue 451        a measurement of a time that was processed a
 mcstate issue 75, figaro issue 175  weights in place of their logarithms
 MSS pull 18, filterpy issue 305     degrees in place of radians
 fuse pull 74                        a start at time 0, and a first time of the clock
+ultralytics pull 25499              a copy that went through single precision
+Sendspin pull 119                   a copy whose time has been rounded
+kalmanjs issue 33,                  times of a clock in nanoseconds or milliseconds
+BLE-Indoor-Positioning issue 31
+Stone-Soup issue 195                dates and durations in place of seconds
 own                                 a delayed copy, a copy after saving, a second sensor
 ==================================  ==========================================================
 """
@@ -386,6 +391,23 @@ def test_clocks_elsewhere() -> None:
         )
 
 
+def test_degrees_in_the_multiplicative_filter() -> None:
+    x = np.r_[np.ones(3), np.zeros(6), [1.0, 0.0, 0.0, 0.0]]
+    pose = satellite_pose(rate=0.1, sigma=0.1)
+    with pytest.warns(
+        RuntimeWarning, match="must be angles in rad, got some 7 turns off"
+    ):
+        mekf(
+            x,
+            0.01 * np.eye(12),
+            np.array([[45.0]]),
+            chart=QuaternionChart(13, 9),
+            model=pose,
+            sensors=[bearing([0, 1], std=0.1)],
+            times=[0.1],
+        )
+
+
 def test_messages_print_such_times() -> None:
     f = GaussianFilter(WALK, [EYE], lag=2)
     state = f.step(start_of(f, t=NOW), NOW + 0.5, [[1.0]])
@@ -407,3 +429,86 @@ def test_messages_print_such_times() -> None:
         with pytest.raises(ValueError, match=text):
             call()
     assert repr(state) == "GaussianState(t=1700000000.5, 1 agents)"
+
+
+# Copies that rounding has changed -----------------------------------------------------------
+
+
+@EACH
+@pytest.mark.parametrize("way", ["events", "step"])
+def test_a_copy_in_single_precision_counts_once(family: str, way: str) -> None:
+    f = FAMILIES[family](WALK, [EYE])
+    value = np.array([0.3])
+    single = value.astype(np.float32).astype(np.float64)
+    one = Observation(1.0, 0, value)
+    two = [one, one.replace(value=single)]
+    once = means(f, f.step(start_of(f), 1.0, [[one]]))
+    with pytest.warns(RuntimeWarning, match=TWICE):
+        if way == "step":
+            twice = means(f, f.step(start_of(f), 1.0, [two]))
+        else:
+            twice = f.run(start_of(f), None, two)["mean"].values[-1]
+    assert np.array_equal(once, twice)
+
+
+def test_two_that_are_close_both_count() -> None:
+    """They differ by more than one is rounded by, or neither is in single precision."""
+    f = GaussianFilter(WALK, [EYE])
+    for other in (0.3 + 1e-9, 0.3 + 1e-6, 0.31):
+        two = [Observation(1.0, 0, [0.3]), Observation(1.0, 0, [other])]
+        with warnings.catch_warnings(action="error"):
+            state = f.step(start_of(f), 1.0, [two])
+        # 1/P = 1/(1 + 1 + .03) + 2/.25, with P of the step by hand: F F' + Q
+        predicted = WALK.F(1.0) @ WALK.F(1.0).T + WALK.Q(0.0, 1.0)
+        variance = 1 / (1 / predicted[0, 0] + 2 / 0.25)
+        assert np.isclose(f.summarize(state).variance[0, 0], variance)
+
+
+@EACH
+@pytest.mark.parametrize("gap", [1e-9, float(np.float32(1.1)) - 1.1])
+def test_a_copy_with_a_rounded_time_is_told(family: str, gap: float) -> None:
+    f = FAMILIES[family](WALK, [EYE])
+    events = [Observation(t, 0, [0.3 * t]) for t in (1.1, 2.0, 3.0)]
+    late = events[0].replace(t=1.1 + gap)
+    with pytest.warns(RuntimeWarning, match="must have one time to count once"):
+        f.run(start_of(f), None, [*events, late])
+    # Another value, another sensor, or a longer time between: nothing is said.
+    with warnings.catch_warnings(action="error"):
+        f.run(start_of(f), None, [*events, late.replace(value=np.array([0.4]))])
+        f.run(start_of(f), None, [*events, late.replace(t=1.2)])
+
+
+@EACH
+def test_times_in_another_unit_are_told(family: str) -> None:
+    f = FAMILIES[family](WALK, [EYE])
+    for unit, factor in {"nano": 1e9, "micro": 1e6, "milli": 1e3}.items():
+        with pytest.warns(
+            RuntimeWarning, match=f"a Unix time in {unit}seconds would be"
+        ):
+            start_of(f, t=NOW * factor)
+    with warnings.catch_warnings(action="error"):
+        start_of(f, t=NOW)
+
+
+def test_dates_are_refused_with_the_way_to_seconds() -> None:
+    f = GaussianFilter(WALK, [EYE])
+    start = start_of(f)
+    now = np.datetime64("2024-03-10T01:00:00")
+    dates = now + np.arange(1, 3).astype("timedelta64[s]")
+    seconds = r"give seconds since the start, \(x - start\) / np.timedelta64\(1, .s.\)"
+    calls = {
+        seconds: [
+            lambda: f.run(start, dates, [np.zeros((2, 1))]),
+            lambda: f.step(start, now, [[0.0]]),
+            lambda: Observation(now, 0, [0.0]),
+            lambda: f.run(start, dates.astype(object), [np.zeros((2, 1))]),
+        ],
+        r"give seconds, x / np.timedelta64\(1, .s.\)": [
+            lambda: f.run(start, dates - now, [np.zeros((2, 1))]),
+            lambda: Observation(dates[0] - now, 0, [0.0]),
+        ],
+    }
+    for text, ways in calls.items():
+        for way in ways:
+            with pytest.raises(ValueError, match=text):
+                way()

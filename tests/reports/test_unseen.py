@@ -10,6 +10,8 @@ Gen.jl issue 117                    weights of minus infinity, time after time
 multicalc-rust issue 205            a weight that falls to zero, and evidence for it later
 particles issue 42                  either of two components is missing at each time
 ardupilot issue 19825               a direction divided by a range of zero
+pykalman issue 58, filterpy         masked arrays: observations, truths, results of functions
+pull 263, dynamax issue 430
 own                                 a radar whose prior mean is its own place, extended filter
 own                                 a target at the edge of the range, in every family
 own                                 one of two components cannot be seen by some particles
@@ -19,11 +21,13 @@ own                                 one of two components cannot be seen by some
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 
+from distfilt import density, filters, network
 from distfilt.filters import (
     EnsembleFilter,
     FilterError,
@@ -34,7 +38,9 @@ from distfilt.filters import (
     TransportFilter,
 )
 from distfilt.kalman import QuaternionChart, mekf
+from distfilt.mixtures import GaussianMixture
 from distfilt.models import Model, constant_velocity, satellite_pose
+from distfilt.network import graphs
 from distfilt.sensors import (
     LikelihoodSensor,
     Sensor,
@@ -332,3 +338,95 @@ def test_a_direction_at_a_range_of_zero(linearization: Any) -> None:
     gain = 1e-4 * cov @ h / (h @ (1e-4 * cov) @ h + 0.01)
     # K (y - x / r) at (3, 4), where x / r is 0.6
     assert np.allclose(used.means[0], mean + gain * (0.7 - 0.6), atol=1e-7)
+
+
+HALF_MASKED = np.ma.masked_array([[9.0, 1.0]], mask=[[True, False]])
+MASKS: dict[str, Any] = {
+    "gaussian": GaussianFilter,
+    "ensemble": EnsembleFilter,
+    "particle": ParticleFilter,
+    "transport": TransportFilter,
+    "mixture": partial(MixtureFilter, target_dim=2),
+    "increments": partial(
+        filters.InformationIncrementFilter, graph=graphs.complete(1), target_dim=2
+    ),
+    "sum": filters.GaussianSumFilter,
+    "grid": partial(
+        filters.GridFilter, grid=density.Grid((20, 20), low=(-9, -9), high=(9, 9))
+    ),
+    "likelihood": partial(
+        filters.LikelihoodConsensusFilter,
+        graph=graphs.complete(1),
+        basis=filters.PolynomialBasis([0, 1]),
+        fusion=network.average_consensus,
+    ),
+    "information": partial(
+        filters.InformationConsensusFilter,
+        graph=graphs.complete(1),
+        fusion=network.average_consensus,
+    ),
+    "channel": partial(filters.ChannelFilter, graph=graphs.path(1)),
+}
+
+
+@pytest.mark.parametrize("family", MASKS)
+def test_a_mask_is_never_dropped(family: str) -> None:
+    """Not in a series, which is taken apart at once, nor in any other place."""
+    f = MASKS[family](still_model(2), [component([0, 1], std=0.5)])
+    prior = (np.zeros(2), np.eye(2))
+    state = f.start(prior, rng=np.random.default_rng(0))
+    text = r"give [xy].filled\(np.nan\), a missing number is NaN"
+    calls = [
+        lambda: f.run(state, [1.0], [HALF_MASKED]),
+        lambda: f.run(state, [1.0], HALF_MASKED[None]),
+        lambda: f.step(state, 1.0, [HALF_MASKED[0]]),
+        lambda: f.step(state, 1.0, [Observation(1.0, 0, HALF_MASKED[0])]),
+        lambda: f.run(state, [1.0], [None], truth=HALF_MASKED),
+        lambda: f.run(state, [1.0], [None], truth=lambda t: HALF_MASKED[0]),
+    ]
+    for call in calls:
+        with pytest.raises(ValueError, match=text):
+            call()
+    filled = f.run(state, [1.0], [HALF_MASKED.filled(np.nan)])
+    # Of the second component alone: mean 1 / 1.25
+    assert np.allclose(filled["mean"][0, 0, 1], 0.8, atol=0.15)
+    assert np.allclose(filled["mean"][0, 0, 0], 0.0, atol=0.2)
+
+
+def test_functions_that_return_masks_are_refused() -> None:
+    def masked(x: np.ndarray, *_: Any) -> Any:
+        return np.ma.masked_greater(x, 1.0)
+
+    text = r"must return numbers, got MaskedArray: give x.filled"
+    with pytest.raises(ValueError, match="h " + text):
+        Sensor(2, masked, np.eye(2)).predict([0.0, 2.0])
+    with pytest.raises(ValueError, match="transition " + text):
+        Model(2, masked, lambda t, dt: np.eye(2)).step([0.0, 2.0], 0.0, 1.0)
+    slope = Sensor(
+        2, lambda x: x, np.eye(2), derivative=lambda x: masked(2 * np.eye(2))
+    )
+    with pytest.raises(ValueError, match="derivative " + text):
+        slope.jacobian([0.0, 2.0])
+    wrapped = Sensor(
+        2, lambda x: x, np.eye(2), residual_function=lambda a, b: masked(a - b)
+    )
+    with pytest.raises(ValueError, match="residual_function " + text):
+        wrapped.residual([0.0, 2.0], [0.0, 0.0])
+    sensor = LikelihoodSensor(2, lambda x, y: masked(x)[..., 0])
+    with pytest.raises(ValueError, match="log_likelihood " + text):
+        sensor.evaluate([0.0, 2.0], [0.0, 0.0])
+
+
+def test_a_sum_at_a_singular_point_says_so() -> None:
+    """A rounded value has the slope zero: nothing is used, as in an extended filter."""
+    rounded = Sensor(1, lambda x: np.round(x, 1), [[0.01]])
+    f = filters.GaussianSumFilter(still_model(1), [rounded])
+    with pytest.warns(RuntimeWarning, match="derivative is zero at every component"):
+        run = f.run(f.start(([1.23], [[0.04]])), [1.0], [[[1.5]]])
+    assert run["unseen"][0, 0] == 1
+    assert np.allclose(run["mean"], 1.23)
+    # Points of an unscented filter see the slope, and components that differ are weighted.
+    g = filters.GaussianSumFilter(still_model(1), [rounded], linearization="unscented")
+    assert g.step(g.start(([1.23], [[0.04]])), 1.0, [[1.5]]).component_means[0, 0] > 1.4
+    two = GaussianMixture([0.5, 0.5], [[1.02], [1.48]], [[[1e-4]], [[1e-4]]])
+    assert f.step(f.start(two), 1.0, [[1.5]]).weights[0, 1] > 0.99

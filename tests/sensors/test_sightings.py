@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from distfilt.sensors import range_bearing, sighted_cov, sighted_place
+from distfilt.sensors import locate_sighting, range_bearing, sighting_cov
 
 OBSERVER = [1, 2, 3]
 
@@ -15,10 +15,10 @@ def test_it_undoes_the_sensor() -> None:
     states = rng.standard_normal((50, 6)) * [1, 5, 5, 3, 5, 5]
     sensor = range_bearing([4, 5], std=(0.1, 0.02), observer=OBSERVER)
     for state in states:
-        place = sighted_place(state, sensor.predict(state), observer=OBSERVER)
+        place = locate_sighting(state, sensor.predict(state), observer=OBSERVER)
         assert np.allclose(place, state[4:])
     # A batch of states, one sighting
-    places = sighted_place(states, [2.0, 0.3], observer=OBSERVER)
+    places = locate_sighting(states, [2.0, 0.3], observer=OBSERVER)
     assert places.shape == (50, 2)
     assert np.allclose(np.linalg.norm(places - states[:, 1:3], axis=1), 2.0)
 
@@ -28,14 +28,14 @@ def test_the_covariance_is_that_of_draws() -> None:
     cov = np.array([[0.04, 0.002], [0.002, 0.0009]])
     draws = np.random.default_rng(1).multivariate_normal([4.0, 0.3], cov, 40_000)
     places = np.array(
-        [sighted_place(state, y, observer=OBSERVER) for y in draws[:4000]]
+        [locate_sighting(state, y, observer=OBSERVER) for y in draws[:4000]]
     )
-    expected = sighted_cov(state, [4.0, 0.3], cov, observer=OBSERVER)
+    expected = sighting_cov(state, [4.0, 0.3], cov, observer=OBSERVER)
     assert np.allclose(np.cov(places.T), expected, atol=0.07 * expected.max())
-    batch = sighted_cov(np.tile(state, (2, 3, 1)), [4.0, 0.3], cov, observer=OBSERVER)
+    batch = sighting_cov(np.tile(state, (2, 3, 1)), [4.0, 0.3], cov, observer=OBSERVER)
     assert np.allclose(batch, expected) and batch.shape == (2, 3, 2, 2)
 
 
 def test_an_observer_has_a_heading() -> None:
     with pytest.raises(ValueError, match="observer must have three entries"):
-        sighted_place(np.zeros(4), [1.0, 0.0], observer=[0, 1])
+        locate_sighting(np.zeros(4), [1.0, 0.0], observer=[0, 1])
