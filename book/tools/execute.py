@@ -21,7 +21,7 @@ import argparse
 import os
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ import nbformat
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 
-from common import ROOT, chosen, fixed_environment, foreign_text
+from common import ROOT, chosen, end_with_children, fixed_environment, foreign_text
 from pictures import differences, extract_pictures, shrink_pictures
 from sockets import AsyncManager
 
@@ -233,8 +233,10 @@ def main() -> int:
     if options.sources:
         problems = [copy_sources(source) for source in sources]
     else:
-        # A process for each chapter: kernels and their environments stay apart.
-        with ProcessPoolExecutor(max_workers=options.jobs) as pool:
+        end_with_children()
+        # A kernel is a process of its own, so a thread is enough to wait for it. No process is
+        # forked: a fork copies locks that other threads hold, and may wait for them forever.
+        with ThreadPoolExecutor(max_workers=options.jobs) as pool:
             n = len(sources)
             compare_bytes = [options.bytes] * n
             problems = list(

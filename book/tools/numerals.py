@@ -1,34 +1,26 @@
-"""Trace every numeral in the prose of the chapters to a number of a cell, an output or a source.
+"""Find every number in the prose of the chapters where it is shown.
 
     python book/tools/numerals.py [CHAPTER ...] [--all]
 
-Prose is the text between the cells, with its tables, exercises and solutions, and of the cells the
-captions and alternative texts. A numeral is traced to a number of equal value,
+Prose is the text between the cells with its tables, exercises and solutions, and of the cells the
+captions and alternative texts. Of a number it is asked that one of these places shows it:
 
-code
-    in a cell of its section; or in any cell, a scenario or a study of the chapter, or the default
-    of a function that it calls, in a line that shares a word with the sentence
-output
-    in a stored output that prints it to the digits given: of its section, or of any section if the
-    numeral has three digits that count
-picture
-    in the digest of the picture that the caption or the alternative text describes
-published
-    in ``data/published``, or given by the paper to a scenario, if the sentence speaks of a paper
-arithmetic
-    none, but it ends a formula of numbers alone, which is worked out here
-cited, known
-    none, but the sentence has a citation, or stands in ``numerals.csv`` with a reason
+section
+    code, an output or a worked formula of its own section that gives the same digits; with three
+    digits that count it may be rounded. A section reaches from one heading or exercise to the next.
+    Code that draws a picture counts for the caption only.
+named place
+    an output or the curves of a figure, or a section, that the sentence names by its label
+constant
+    a number of the page, of a study or of a scenario, whose name is in the sentence: with all its
+    words, or two of them
+output of the page
+    anywhere, if it has three digits that count or is in words
 
-A numeral with one digit that counts, and a whole number of two, always need a word that is shared;
-without one they are counted as **beside**. Left out are names, years, numbers of chapters, figures,
-equations and the like, and definitions in formulas. Numbers up to twelve and halves without a unit
-are counted as **small**.
-
-A trace shows that the number exists, not that the sentence is about it. How much that is worth is
-measured: each traced numeral is replaced by others of its length, and the share of those that would
-be traced as well is printed. The tool ends with an error if a numeral has no trace, or a known
-phrase is gone.
+The curves of a picture are also shown by its caption and its alternative text. A number with a
+citation in its sentence is the cited work's, and 95% is the level of an interval. Left out are
+names, years, numbers of chapters, figures, equations and the like, definitions in formulas, and
+counts in words up to twelve. The tool ends with an error if a number is shown nowhere.
 """
 
 from __future__ import annotations
@@ -36,7 +28,6 @@ from __future__ import annotations
 import argparse
 import ast
 import contextlib
-import csv
 import math
 import re
 import sys
@@ -57,41 +48,20 @@ from sphinx.search.en import ENGLISH_STOPWORDS
 from common import BOOK, ROOT, SLIDER, VERDICT, chosen
 from execute import read
 
-KNOWN = Path(__file__).with_suffix(".csv")
-PAPERS = dict(
-    zip(
-        ("01", "02", "03", "04", "05", "06", "07", "08", "09", "10"),
-        ["grange"] * 4 + ["das"] * 2 + ["semeraro"] * 2 + ["zheng"] * 2,
-        strict=True,
-    )
-)
-"""The paper that the chapter of each number reproduces."""
+SCENARIOS = dict.fromkeys(("01", "02", "03", "04"), "grange")
+SCENARIOS |= dict.fromkeys(("05", "06"), "das")
+SCENARIOS |= dict.fromkeys(("07", "08"), "semeraro")
+SCENARIOS |= dict.fromkeys(("09", "10"), "zheng")
+"""The scenarios of the chapter of each number."""
 
 # --- numbers in words and digits ------------------------------------------------------------------
 
-ONES = (
-    "zero",
-    "one",
-    "two",
-    "three",
-    "four",
-    "five",
-    "six",
-    "seven",
-    "eight",
-    "nine",
-    "ten",
-    "eleven",
-    "twelve",
-    "thirteen",
-    "fourteen",
-    "fifteen",
-    "sixteen",
-    "seventeen",
-    "eighteen",
-    "nineteen",
+ONES = re.findall(
+    r"\w+",
+    """zero one two three four five six seven eight nine ten eleven twelve thirteen fourteen
+    fifteen sixteen seventeen eighteen nineteen""",
 )
-TENS = ("twenty", "thirty", "forty", "fifty", "sixty", "seventy", "eighty", "ninety")
+TENS = re.findall(r"\w+", "twenty thirty forty fifty sixty seventy eighty ninety")
 LARGE = {"hundred": 100, "thousand": 1000, "million": 10**6, "billion": 10**9}
 COUNTS = {word: k for k, word in enumerate(ONES)}
 COUNTS |= {word: 10 * k for k, word in enumerate(TENS, start=2)}
@@ -119,7 +89,6 @@ DIGITS = re.compile(
 )
 UNITS = {
     r"%|per ?cent\b": (0.01,),
-    r"times\b|-?fold\b": (),
     r"km\b|kilomet": (1e3, 1e-3),
     r"cm\b|centimet": (1e-2,),
     r"mm\b|millimet": (1e-3, 1e-6),
@@ -130,14 +99,15 @@ UNITS = {
     r"s\b|seconds?\b": (1000.0,),
     r"days?\b": (86400.0, 24.0),
     r"°|degrees?\b": (math.pi / 180,),
-    r"rad\b|radian|nats?\b|arcsec|orders? of|Hz\b": (),
+    r"times\b|-?fold\b|rad\b|radian|nats?\b|arcsec|orders? of|Hz\b": (),
 }
 """Units after a number, and factors by which its value may be multiplied in the code."""
 LABELS = (
     r"chapters?|figs?\.|figures?|tables?|sections?|equations?|eqs?\.|algorithms?|lines?|steps?"
     r"|items?|agents?|parts?|exercises?|rows?|version|theorems?|pages?|panels?|mixands?|sensors?"
     r"|conditions?|neighbours?|bodies|body|component|column|node|member|lemma|corollary|order"
-    r"|degree|level|satellites?|robots?|state|appendix"
+    r"|degree|level|satellites?|robots?|state|appendix|errat(?:um|a)|places?"
+    r"|rounds?|title|remarks?|facts?"
 )
 """Nouns whose numbers are names."""
 
@@ -154,32 +124,40 @@ class Numeral:
     section: int
     sentence: str
     words: frozenset[str]
+    labels: frozenset[str] = frozenset()
+    """The figures and sections that the sentence names, or the figure that it describes."""
     source: str = ""
-    picture: Facts | None = None
-    """The numbers of the picture that the sentence describes."""
 
     @property
-    def is_small(self) -> bool:
-        """Whether it has one digit that counts, or is a whole number of two."""
-        n_digits = digits(self.text)
-        return n_digits < 2 or (self.value == int(self.value) and n_digits < 3)
-
-    @property
-    def factors(self) -> tuple[float, ...]:
-        return (1.0, *(UNITS[self.unit] if self.unit else ()))
+    def is_long(self) -> bool:
+        """Whether it has three digits that count."""
+        return len(re.sub(r"e.*|[^0-9]", "", self.text).lstrip("0")) > 2
 
 
 @dataclass
-class Fact:
-    """A number of the code, of an output or of a source, with the words of its line."""
+class Shown:
+    """A number of the code, of an output or of a source."""
 
     kind: str
     value: float
     where: str
-    section: int
-    words: frozenset[str]
-    half: float = 0.0
-    """Half a unit in the last digit that an output prints."""
+    section: int = -1
+    """The section that shows it; -1 for a picture and for what is outside the page."""
+    labels: frozenset[str] = frozenset()
+    """The labels of its section and its picture."""
+    name: frozenset[str] = frozenset()
+    """The words of its name."""
+    step: float = 0.0
+    """One unit in the last digit that an output prints."""
+
+    def belongs_to(self, numeral: Numeral, exact: bool) -> bool:
+        """Return whether a sentence may take a number from this place."""
+        if self.section == numeral.section or self.labels & numeral.labels:
+            return True
+        if self.kind == "output":
+            return exact and numeral.is_long or not numeral.step
+        shared = self.name & numeral.words
+        return len(shared) > 1 or bool(shared) and shared == self.name
 
 
 GENERIC = frozenset(
@@ -187,7 +165,7 @@ GENERIC = frozenset(
         r"\w+",
         """less least more most greater between within equal close checks true false number value
         name label title text caption figure table first second last size shape axis axes index
-        default array numpy list dict range print plot style color marker alpha line times""",
+        default array numpy list dict range print plot style color marker alpha line times std""",
     )
 )
 """Words that are in too many lines to name a number, beside the stop words of English."""
@@ -239,18 +217,13 @@ def count_of(words: list[str]) -> float:
     return total + part
 
 
-def digits(text: str) -> int:
-    """Return the number of significant digits."""
-    return len(re.sub(r"e.*|[^0-9]", "", text).lstrip("0"))
-
-
-def step_of(text: str, value: float) -> float:
-    """Return one unit in the last digit; for words, a fifth of a fraction, else one."""
-    if re.search(r"\d", text):
-        # 1.20e3 has two decimals, and its last digit is worth 10.
-        mantissa, _, power = text.partition("e")
-        return 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2]))
-    return 1.0 if value == int(value) else 0.2 * abs(value)
+def step_of(text: str) -> float:
+    """Return one unit in the last digit of a number in digits; zero for words."""
+    if not re.search(r"\d", text):
+        return 0.0
+    # 1.20e3 has two decimals, and its last digit is worth 10.
+    mantissa, _, power = text.partition("e")
+    return 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2]))
 
 
 # --- the prose ------------------------------------------------------------------------------------
@@ -261,6 +234,7 @@ def evaluate(text: str) -> float | None:
     # TeX becomes Python: \frac12, \frac{1}{2}, \sqrt{2}, |x|, e^x, \cdot, 2\pi.
     for tex, code in (
         (r"\\[td]?frac(\d)(\d)", r"(\1/\2)"),
+        (r"\\[td]?frac(\d)\{(\d+)\}", r"(\1/\2)"),
         (r"\\[td]?frac\{([^{}]*)\}\{([^{}]*)\}", r"((\1)/(\2))"),
         (r"\\(sqrt|log)\s*\{?(\d+)\}?", r"\1(\2)"),
         (r"\|([^|]+)\|", r"abs(\1)"),
@@ -268,13 +242,12 @@ def evaluate(text: str) -> float | None:
         (r"\be\^", "(exp(1))^"),
         (r"\\cdot|\\times", "*"),
         (r"\^", "**"),
-        (r"\\[,; ]|[\s{}]", ""),
+        (r"\\(?:left|right|[,;! ])|[\s{}&]", ""),
         (r"(?<=[\d)])(?=[a-z(])", "*"),
     ):
         text = re.sub(tex, code, text)
     # With any other name it is a definition, not arithmetic.
-    numbers_only = re.fullmatch(r"(?:sqrt|log|abs|exp|pi|[-+*/().\d])+", text)
-    if not numbers_only or not re.search(r"[-+*/a-z]", text):
+    if not re.fullmatch(r"(?:sqrt|log|abs|exp|pi|[-+*/().\d])+", text):
         return None
     names = {"sqrt": math.sqrt, "log": math.log, "abs": abs, "pi": math.pi}
     with contextlib.suppress(SyntaxError, ArithmeticError, TypeError, ValueError):
@@ -282,23 +255,41 @@ def evaluate(text: str) -> float | None:
     return None
 
 
+def worked_out(formula: str) -> list[str]:
+    """Return the sides of a formula that are numbers alone and equal to the side before or after.
+
+    A side behind an approximate sign may be off by two percent, any other by its last digit.
+    """
+    formula = formula.replace("{,}", "").replace("\\,", "").replace("\\%", "")
+    signs = r"(=|\\approx|\\leq?|\\geq?|<|>|\\\\)"
+    sides = re.split(signs, re.sub(r"[.,;]\s*$", "", formula.strip()))
+    found = []
+    for left, sign, right in zip(sides[::2], sides[1::2], sides[2::2], strict=False):
+        values = evaluate(left), evaluate(right)
+        if sign not in ("=", r"\approx") or None in values:
+            continue
+        # Two plain numbers are no calculation.
+        if re.fullmatch(r"[\s&{}-]*[\d.]+[\s&{}]*", left):
+            continue
+        step = step_of(re.sub(r"[^\d.]", "", right) or "1")
+        loose = 0.02 * abs(values[1]) if "approx" in sign else 0.0
+        if abs(values[0] - values[1]) <= max(loose, 0.5001 * step):
+            found += [left, right]
+    return found
+
+
 def text_of_formula(match: re.Match[str]) -> str:
     """Return the text that replaces a formula: a blank, or the number at its end."""
     formula = match[1].replace("{,}", "").replace("\\,", " ").replace("\\%", "%")
     formula = formula.strip()
     # "2 + 3 = 5": the number at the end is checked here, if the rest is numbers only.
-    *_, left, sign, right = ["", "", *re.split(r"(=|\\approx)", formula)]
-    if re.fullmatch(r" ?-?\d+(?:\.\d+)? ?", right):
-        value = float(right)
-        result = evaluate(left)
-        loose = 0.02 * abs(value) if "approx" in sign else 0.0
-        margin = max(loose, 0.5001 * step_of(right.strip(), value))
-        if result is not None and abs(result - value) <= margin:
-            return f" {right.strip()} ≗ "
+    sides = worked_out(match[1])
+    if sides and re.fullmatch(r"\s*-?\d+(?:\.\d+)?\s*", sides[-1]):
+        return f" {sides[-1].strip()} ≗ "
     # "2 · 10^3" is one number.
     power = re.fullmatch(r"(?:([\d.]*) ?\\(?:cdot|times) ?)?10\^\{?(-?\d+)\}?", formula)
     if power:
-        return f" {float(power[1] or 1) * 10.0 ** int(power[2]):g} "
+        return f" {power[1] or 1}e{power[2]} "
     if re.fullmatch(r"\\?(?:pm)?[-\d. %]+", formula):
         return f" {formula.removeprefix(chr(92) + 'pm')} "
     # "x = 3.5" is a statement, but "x = 0" or "x = 1" is mostly a definition.
@@ -315,8 +306,9 @@ def plain(text: str) -> str:
         (r"(?ms)^(`{3,})\{(?:math|include|eval-rst)\}.*?^\1$", ""),
         (r"(?m)^(`{3,}|:{3,}).*$|^:\w+:.*$|^%.*$|^\(.*\)=$", ""),
         (r"(?s)\$\$.*?\$\$", ""),
-        # A mark stands for a citation, which `trace` accepts as a source.
+        # Marks stand for a citation and for the figure or section that a sentence names.
         (r"\{cite:\w\}`[^`]*`", " ⸢cited⸣ "),
+        (r"\{(?:num)?ref\}`(?:[^`<]*<)?([\w-]+)>?`", r" ⸢\1⸣ "),
         (r"\{[\w:]+\}`[^`]*`", " "),
         (r"\]\([^)]*\)", "]"),
         # The number of a table's row, and of a list's item
@@ -335,8 +327,9 @@ def without_names(sentence: str) -> str:
     roman = r"[IVX]+\b(?:(?:, | and | to )[IVX]+\b)*"
     for pattern in (
         rf"(?i)\b(?:{LABELS})\s+(?:{numbers}|{roman})",
+        r"⸢.*?⸣",
         # References such as (12), names such as x1 or 2-D, "12, 2003)" of a citation
-        r"\((?!\d+\) =)\d{1,2}[a-z]?\)(?:-\(\d+\))?",
+        r"\((?!\d+\) =)\d{1,2}[a-z]?\)(?:-\(\d+\))?|\[\d{1,2}\]",
         r"\b[A-Za-z]+\d[\w.]*|\b\d+-D\b|\b\d+(?!e-\d)[a-zA-Z]\w*-",
         r"\b\d+, (?:19|20)\d\d\)",
         r"(?<![\d.] )(?<![\d.])\b(?:19|20)\d\d\b(?! ?(?:m|s|km|runs|draws|points)\b|\.\d)",
@@ -357,23 +350,25 @@ def numerals_of(text: str, section: int) -> Iterator[Numeral]:
     """Yield the numerals of some prose."""
     for sentence in sentences(text):
         clean = without_names(sentence)
-        words = stems(sentence)
+        labels = frozenset(re.findall(r"⸢([\w-]+)⸣", sentence))
+        words = stems(re.sub(r"⸢.*?⸣", "", sentence))
         in_digits = list(DIGITS.finditer(clean))
         taken = {k for hit in in_digits for k in range(*hit.span())}
         # "2 hundred" is found in digits and in words: the first counts.
         in_words = [h for h in WORDS.finditer(clean) if not taken & {*range(*h.span())}]
         for hit in (*in_digits, *in_words):
-            text = hit[0].strip()
-            value = value_of(text)
+            number = hit[0].strip()
             # The unit follows the number, after a blank or a hyphen.
             after = clean[hit.end() :].lstrip(" -)")
             unit = unit_of(after)
-            step = step_of(text, value)
             # The unit counts as a word: "after 20 s" may be a parameter in seconds.
             named = words | ({unit} if unit else set())
-            numeral = Numeral(text, value, step, unit, section, sentence, named)
-            if re.fullmatch(r"an?|one", text, re.I) or (
-                text.lower() in ("third", "quarter") and not unit
+            value, step = value_of(number), step_of(number)
+            numeral = Numeral(
+                number, value, step, unit, section, sentence, named, labels
+            )
+            if re.fullmatch(r"an?|one", number, re.I) or (
+                number.lower() in ("third", "quarter") and not unit
             ):
                 continue  # an article, a pronoun, "a third filter"
             numeral.source = source_of_form(numeral, after)
@@ -389,16 +384,20 @@ def unit_of(after: str) -> str:
 
 
 def source_of_form(numeral: Numeral, after: str) -> str:
-    """Return the source that a numeral has by its form: arithmetic, small, or none."""
+    """Return the source that a numeral has by its form: a formula, a count in words, or none."""
     if after.startswith("≗"):
-        return "arithmetic"
+        return "formula"
+    # The usual level of an interval
+    if numeral.text == "95" and after.startswith("%"):
+        return "level"
     text = numeral.text.lower()
-    whole = numeral.value == int(numeral.value)
-    tiny = (whole and abs(numeral.value) <= 12) or numeral.value == 0.5
+    if re.search(r"\d", text):
+        return ""
+    small = numeral.value in (0.5, *range(13)) and not numeral.unit
     ordinal = ORDINAL.fullmatch(text) and not re.match(r"of\b", after)
     # "two seconds" and "two metres" are phrases, not measurements.
     phrase = text == "two" and numeral.unit.startswith(("s", "m", "day"))
-    return "small" if (tiny and not numeral.unit) or ordinal or phrase else ""
+    return "count" if small or ordinal or phrase else ""
 
 
 # --- the numbers of the code, its outputs and its sources -----------------------------------------
@@ -414,27 +413,51 @@ def constant(node: ast.AST) -> float | None:
     return None
 
 
-def code_facts(code: str, where: str, section: int = -1) -> Iterator[Fact]:
-    """Yield the numbers of code, each with the words of its line and its statement's first."""
+def code_numbers(
+    code: str, where: str, section: int = -1, labels: frozenset[str] = frozenset()
+) -> Iterator[Shown]:
+    """Yield the numbers of code with the words of their names."""
     lines = ["", *code.splitlines()]
-    tree = ast.parse(code)
-    first = dict.fromkeys(range(len(lines)), 0)
-    # ast.walk visits the outer statements first, so that the innermost one stays.
-    for node in ast.walk(tree):
-        if isinstance(node, ast.stmt | ast.arguments):
-            span = getattr(node, "lineno", 0), getattr(node, "end_lineno", None) or 0
-            first |= dict.fromkeys(range(span[0], span[1] + 1), span[0])
-    for node in ast.walk(tree):
+
+    def walk(node: ast.AST, name: str) -> Iterator[Shown]:
+        # A number is named by what it is assigned to, or by the text beside it.
+        match node:
+            case ast.Assign():
+                name = " ".join(map(ast.unparse, node.targets))
+            case ast.AnnAssign():
+                name = ast.unparse(node.target)
+            case ast.keyword(arg=str(argument)):
+                name = argument if stems(argument) else name
+            case ast.Call(args=[ast.Constant(value=str(text)), *_]):
+                name = text
+            case ast.Dict():
+                for key, value in zip(node.keys, node.values, strict=True):
+                    key_text = ast.unparse(key) if key else ""
+                    yield from walk(value, key_text)
+                return
         value = constant(node)
         if value is not None:
-            line = node.lineno  # type: ignore[attr-defined]
-            words = stems(f"{lines[first[line]]} {lines[line]}")
-            yield Fact("code", value, f"{where}: {lines[line].strip()}", section, words)
-        # The message of an assertion says what it checks.
-        if isinstance(node, ast.Assert) and isinstance(node.msg, ast.Constant):
-            words = stems(ast.unparse(node))
-            for numeral in numerals_of(str(node.msg.value), section):
-                yield Fact("code", numeral.value, f"{where}: assert", section, words)
+            place = f"{where}: {lines[node.lineno].strip()}"
+            yield Shown("code", value, place, section, labels, stems(name))
+            return
+        for child in ast.iter_child_nodes(node):
+            yield from walk(child, name)
+
+    yield from walk(ast.parse(code), "")
+
+
+def formula_numbers(text: str, section: int, labels: frozenset[str]) -> Iterator[Shown]:
+    """Yield the numbers of the formulas that are worked out."""
+    blocks = r"(?s)`{3,}\{math\}(.*?)```|\$\$(.*?)\$\$|\$([^$]+)\$"
+    for match in re.finditer(blocks, text):
+        formula = re.sub(
+            r"(?m)^:.*$|\\(?:begin|end)\{\w+\}",
+            "",
+            "".join(filter(None, match.groups())),
+        )
+        for side in worked_out(formula):
+            for number in re.findall(r"\d+(?:\.\d+)?", side.replace("\\,", "")):
+                yield Shown("formula", float(number), side, section, labels)
 
 
 def flat(value: Any) -> Iterator[float]:
@@ -447,248 +470,143 @@ def flat(value: Any) -> Iterator[float]:
         yield value
 
 
-def scenario_facts(path: Path) -> Iterator[Fact]:
-    """Yield the numbers of a scenario, with the words of their names and their units.
-
-    A value that the paper gives is also one that it prints.
-    """
+def scenario_numbers(path: Path) -> Iterator[Shown]:
+    """Yield the numbers of a scenario with the words of their names and of their reasons."""
     data = tomllib.loads(path.read_text(encoding="utf-8"))
-    title = data.pop("title", "")
+    data.pop("title", "")
     entries = data.pop("parameters", {}) | data.pop("notes", {})
     for name, entry in entries.items():
         reason = " ".join(entry.get(key, "") for key in ("where", "reason", "note"))
-        parts = entry["unit"].split(", ")
-        units = {unit for unit in UNITS for part in parts if re.match(unit, part)}
-        words = stems(f"{name} {title}")
-        more_words = stems(f"{name} {reason}")
-        for value in flat(entry["value"]):
-            yield Fact("code", value, f"{path.name}: {name}", -1, words | units)
-            if entry["source"] == "given":
-                yield Fact("published", value, path.name, -1, more_words)
-        for match in DIGITS.finditer(reason):
-            # One digit in a reason would match too many sentences.
-            if digits(match[0]) > 1:
-                value = value_of(match[0])
-                yield Fact("code", value, f"{path.name}: {name}", -1, more_words)
+        values = [*flat(entry["value"])]
+        # The reason may hold another value, such as the paper's.
+        values += [value_of(m[0]) for m in DIGITS.finditer(reason) if len(m[0]) > 1]
+        words = stems(f"{name} {reason}")
+        where = f"{path.name}: {name}"
+        for value in values:
+            yield Shown("constant", value, where, name=words)
+            yield Shown("constant", value, where, name=stems(name))
     for key, rows in data.items():
         for row in rows:
             for name, cell in row.items():
                 for value in flat(cell):
-                    words = stems(f"{key} {name}")
-                    yield Fact("code", value, f"{path.name}: {key}.{name}", -1, words)
+                    where = f"{path.name}: {name}"
+                    yield Shown("constant", value, where, name=stems(f"{key} {name}"))
 
 
-def printed_facts(path: Path) -> Iterator[Fact]:
-    """Yield the numbers that a paper prints, each with the words of its line."""
-    for line in path.read_text(encoding="utf-8").splitlines():
-        for match in DIGITS.finditer(line):
-            value = value_of(match[0])
-            yield Fact("published", value, path.name, -1, stems(line))
-
-
-def rows_of(output: Any) -> Iterator[str]:
-    """Yield the lines that an output prints, and the rows of its tables with their heads."""
+def texts_of_output(output: Any) -> Iterator[str]:
+    """Yield what an output prints, and the cells of its tables."""
     data = output.get("data", {})
     page = data.get("text/html", "")
     # The text of a picture is a digest, whose digits prove nothing.
     if SLIDER in page or any(mime.startswith("image/") for mime in data):
         return
-    yield from output.get("text", "").splitlines()
+    yield output.get("text", "")
     yield from map(str, data.get(VERDICT, {}).values())
-    if not page:
-        yield from data.get("text/plain", "").splitlines()
-    for table in BeautifulSoup(page, "html.parser").find_all("table"):
-        # A number of a table is named by the caption and the head of its column.
-        heads = table.find_all(["caption", "thead"])
-        head = " ".join(part.get_text(" ") for part in heads)
-        for row in table.find_all("tr"):
-            yield f"{row.get_text(' ')}\n{head}"
+    yield BeautifulSoup(page, "html.parser").get_text(" ") or data.get("text/plain", "")
 
 
-def picture_facts(cell: Any) -> Iterator[Fact]:
-    """Yield the ranges and means of the curves of a cell's pictures, from their digests."""
-    for output in cell.outputs:
-        digest = output.get("data", {}).get("text/plain", "")
-        # "line 1 y: 60 values, 1..25, mean 4.6, projection 0.3": the last is a hash.
-        for line in re.findall(r"values, (.*), projection", digest):
-            for text in re.findall(
-                r"-?\d[\d.]*\d(?:e[-+]\d+)?|\d", line.replace("..", " ")
-            ):
-                value = float(text)
-                half = 0.5 * step_of(text, value)
-                yield Fact("output", value, "picture", -1, frozenset(), half)
-
-
-def output_facts(cell: Any, where: str, section: int) -> Iterator[Fact]:
+def output_numbers(
+    cell: Any, where: str, section: int, labels: frozenset[str]
+) -> Iterator[Shown]:
     """Yield the numbers that a cell's stored outputs print."""
     for output in cell.outputs:
-        for row in rows_of(output):
-            words = stems(row)
-            for match in DIGITS.finditer(row):
-                value = value_of(match[0])
-                half = 0.5 * step_of(match[0], value)
-                yield Fact("output", value, where, section, words, half)
+        for text in texts_of_output(output):
+            for match in DIGITS.finditer(text):
+                value, step = value_of(match[0]), step_of(match[0])
+                yield Shown("output", value, where, section, labels, step=step)
+
+
+def curve_numbers(cell: Any, where: str, labels: frozenset[str]) -> Iterator[Shown]:
+    """Yield the ranges of the curves of a cell's pictures, from their digests."""
+    for output in cell.outputs:
+        digest = output.get("data", {}).get("text/plain", "")
+        # "line 1 y: 60 values, 1..25, mean 4.6, projection 0.3"
+        for line in re.findall(r"values, (.*?), mean", digest):
+            for text in line.split(".."):
+                with contextlib.suppress(ValueError):
+                    value, step = float(text), step_of(text)
+                    yield Shown("picture", value, where, labels=labels, step=step)
 
 
 @cache
-def study_facts(name: str) -> tuple[Fact, ...]:
-    """Return the numbers of a study's script and its imports, and its number of stored rows."""
+def study_numbers(name: str) -> tuple[Shown, ...]:
+    """Return the numbers of a study's script and its imports."""
     path = BOOK / "studies" / f"{name.replace('-', '_')}.py"
     if not path.is_file():
         return ()
     code = path.read_text(encoding="utf-8")
-    facts = list(code_facts(code, path.name))
+    numbers = list(code_numbers(code, path.name))
     # A study that imports another script uses its numbers too.
     imports = r"^(?:import|from) (\w+)|script\(\"([\w-]+)\"\)"
     for other in re.findall(imports, code, re.M):
-        facts += study_facts(other[0] or other[1])
-    label = re.search(r'^NAME.*?"([\w-]+)"', code, re.M)
-    words = stems("runs seeds pairs study stored trials times draws")
-    for stored in (ROOT / "data" / "studies").glob(
-        f"*/{label[1] if label else name}.csv"
-    ):
-        rows = re.findall(r"(?m)^[^#\n]", stored.read_text(encoding="utf-8"))
-        facts.append(Fact("code", len(rows) - 1, f"rows of {stored.name}", -1, words))
-    return tuple(facts)
+        numbers += study_numbers(other[0] or other[1])
+    return tuple(numbers)
 
 
 @cache
-def defaults() -> dict[str, list[Fact]]:
-    """Return the default values of the functions of the library and of the kit, by name."""
-    facts: dict[str, list[Fact]] = {}
-    for folder in (ROOT / "distfilt", BOOK / "kit" / "bookkit"):
-        for path in sorted(folder.rglob("*.py")):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.FunctionDef):
-                    # One line an argument, so that only its own name counts.
-                    code = "\n".join(
-                        f"{node.name}_{argument.arg} = {ast.unparse(default)}"
-                        for argument, default in defaults_of(node.args)
-                    )
-                    more = code_facts(code, node.name)
-                    facts.setdefault(node.name, []).extend(more)
-    return facts
-
-
-def defaults_of(spec: ast.arguments) -> Iterator[tuple[ast.arg, ast.expr]]:
-    """Yield the arguments that have a default, each with it."""
-    # Defaults belong to the last positional arguments, so both are read from the end.
-    yield from zip(spec.args[::-1], spec.defaults[::-1], strict=False)
-    for argument, default in zip(spec.kwonlyargs, spec.kw_defaults, strict=True):
-        if default is not None:
-            yield argument, default
-
-
-@cache
-def paper_facts(paper: str) -> tuple[Fact, ...]:
-    """Return the numbers of a paper's scenarios, and those that it prints."""
-    facts: list[Fact] = []
+def numbers_of_scenarios(paper: str) -> tuple[Shown, ...]:
+    """Return the numbers of a paper's scenarios."""
+    numbers: list[Shown] = []
     for path in sorted((ROOT / "data" / "scenarios" / paper).glob("*.toml")):
-        facts += scenario_facts(path)
-    for path in sorted((ROOT / "data" / "published" / paper).glob("*.csv")):
-        facts += printed_facts(path)
-    return tuple(facts)
+        numbers += scenario_numbers(path)
+    return tuple(numbers)
 
 
-def facts_of_sources(source: Path, code: str) -> list[Fact]:
-    """Return the numbers of the studies, functions, scenarios and papers of a chapter."""
-    facts: list[Fact] = []
+def numbers_of_sources(source: Path, code: str) -> list[Shown]:
+    """Return the numbers of the studies and scenarios of a chapter."""
+    numbers: list[Shown] = []
     studies = re.findall(r"(?:script\(|stored\(\s*\"\w+\",\s*)\"([\w-]+)\"", code)
     for name in sorted(set(studies)):
-        facts += study_facts(name)
-    for name in sorted(set(re.findall(r"\b([a-z]\w+)\(", code))):
-        facts += defaults().get(name, ())
+        numbers += study_numbers(name)
     # The first page shows results of chapter 4, so it may use its numbers.
     if source.stem == "index":
         for other in chosen(["04", "04b"]):
-            facts += [replace(f, section=-1) for f in read_chapter(other)[1]]
-    paper = PAPERS.get(source.stem[:2])
-    return [*facts, *(paper_facts(paper) if paper else ())]
-
-
-# --- the trace ------------------------------------------------------------------------------------
-
-SPEAKS = re.compile(
-    r"paper|print|publish|\b(?:table|fig|algorithm|section|title)", re.I
-)
-"""Words of a sentence that speaks of a paper."""
-
-
-class Facts:
-    """Numbers in the order of their absolute values."""
-
-    def __init__(self, facts: Iterable[Fact]) -> None:
-        self.facts = sorted(facts, key=lambda f: abs(f.value))
-        self.values = [abs(f.value) for f in self.facts]
-
-    def between(self, low: float, high: float) -> list[Fact]:
-        """Return those with an absolute value in an interval."""
-        first = bisect_left(self.values, low)
-        return self.facts[first : bisect_right(self.values, high)]
-
-    def equal_to(self, numeral: Numeral) -> Iterator[Fact]:
-        """Yield the numbers that a numeral may state, in its own unit or another one."""
-        in_words = not re.search(r"\d", numeral.text)
-        for factor in numeral.factors:
-            value = abs(numeral.value * factor)
-            half = 0.5001 * numeral.step * factor
-            # An output must be as precise as the sentence, or more.
-            for fact in self.between(value - half, value + half):
-                if fact.kind == "output" and fact.half <= half:
-                    yield fact
-            # "a fifth" may be the number 5 of the code.
-            targets = [value, 1 / value] if in_words and 0 < value < 1 else [value]
-            for target in targets:
-                slack = 1e-9 + 1e-6 * target
-                for fact in self.between(target - slack, target + slack):
-                    if fact.kind != "output":
-                        yield fact
-
-
-def trace(numeral: Numeral, facts: Facts) -> str:
-    """Return where a numeral comes from, or ''."""
-    beside = ""
-    long = digits(numeral.text) > 2
-    of_paper = SPEAKS.search(numeral.sentence)
-    for fact in sorted(
-        facts.equal_to(numeral), key=lambda f: f.section != numeral.section
-    ):
-        in_section = fact.section == numeral.section
-        shares_word = bool(numeral.words & fact.words)
-        named = shares_word or not numeral.is_small
-        good = {
-            "code": shares_word or (in_section and named),
-            "output": long or (in_section and named),
-            "published": of_paper and (shares_word or numeral.value % 1),
-        }
-        if good[fact.kind]:
-            return f"{fact.kind}: {fact.where}"
-        if in_section and fact.kind == "code":
-            beside = f"beside: {fact.where}"
-    if numeral.picture and any(numeral.picture.equal_to(numeral)):
-        return "picture: its digest"
-    return "cited: by the sentence" if "⸢cited⸣" in numeral.sentence else beside
-
-
-def others(numeral: Numeral) -> Iterator[Numeral]:
-    """Yield the same sentence with other numbers of the same length."""
-    in_digits = re.search(r"\d", numeral.text)
-    if in_digits or numeral.value == int(numeral.value):
-        length = digits(numeral.text) if in_digits else len(str(int(numeral.value)))
-        low = 10 ** (max(length, 1) - 1)
-        # Numbers with as many digits, spread by a multiple of a prime: no random draw.
-        spread = (7919 * k + int(abs(numeral.value)) for k in range(1, 17))
-        unit = numeral.step if in_digits else 1.0
-        values = [unit * (low + k % (9 * low)) for k in spread]
-    else:
-        values = [1 / k for k in (3, 4, 5, 7, 8, 9, 12, 15, 20, 30)]
-    for value in values:
-        if not math.isclose(value, abs(numeral.value)):
-            step = numeral.step if in_digits else step_of("", value)
-            yield replace(numeral, value=value, step=step)
+            numbers += [replace(s, section=1) for s in read_chapter(other)[1]]
+    paper = SCENARIOS.get(source.stem[:2])
+    return [*numbers, *(numbers_of_scenarios(paper) if paper else ())]
 
 
 # --- the chapters ---------------------------------------------------------------------------------
+
+
+class Numbers:
+    """The numbers that a chapter shows, in the order of their values."""
+
+    def __init__(self, numbers: Iterable[Shown]) -> None:
+        self.all = sorted(numbers, key=lambda shown: abs(shown.value))
+        self.values = [abs(shown.value) for shown in self.all]
+
+    def source_of(self, numeral: Numeral) -> str:
+        """Return where a number of the prose is shown, or ''."""
+        if "cited" in numeral.labels:
+            return "cited"
+        for factor in (1.0, *UNITS.get(numeral.unit, ())):
+            value = abs(numeral.value) * factor
+            for shown in self.equal_to(value, numeral.step * factor, numeral.is_long):
+                exact = math.isclose(abs(shown.value), value, rel_tol=1e-6)
+                if shown.belongs_to(numeral, exact):
+                    return f"{shown.kind}: {shown.where}"
+        return ""
+
+    def equal_to(self, value: float, step: float, is_long: bool) -> Iterator[Shown]:
+        """Yield the numbers that a numeral with this value and last digit may state."""
+        # In words a number is round: "forty", "a fifth".
+        round_half = 0.5 if value == int(value) else 0.1 * value
+        half = 0.5001 * step or round_half
+        for shown in self.between(value - half, value + half):
+            exact = math.isclose(abs(shown.value), value, rel_tol=1e-6, abs_tol=1e-9)
+            # Curves and long numbers may be rounded; any other is given as it is shown.
+            rounded = shown.kind == "picture" or is_long
+            if exact or (rounded and 0 < shown.step <= step or shown.step and not step):
+                yield shown
+        # "A fifth" may be the number 5 of the code.
+        if not step and 0 < value < 1:
+            yield from self.between(1 / value - 1e-9, 1 / value + 1e-9)
+
+    def between(self, low: float, high: float) -> list[Shown]:
+        """Return those with an absolute value in an interval."""
+        first = bisect_left(self.values, low)
+        return self.all[first : bisect_right(self.values, high)]
 
 
 def texts_of(cell: Any) -> Iterator[str]:
@@ -701,89 +619,70 @@ def texts_of(cell: Any) -> Iterator[str]:
             yield ast.unparse(node.value).strip("'\"")
 
 
-def read_chapter(source: Path) -> tuple[list[Numeral], list[Fact]]:
-    """Return the numerals of a chapter and the numbers of its run."""
+def read_chapter(source: Path) -> tuple[list[Numeral], list[Shown]]:
+    """Return the numerals of a chapter and the numbers that it shows."""
     notebook = nbformat.read(source.with_suffix(".ipynb"), as_version=4)
     outputs = iter([cell for cell in notebook.cells if cell.cell_type == "code"])
     numerals: list[Numeral] = []
-    facts: list[Fact] = []
+    numbers: list[Shown] = []
     codes: list[str] = []
     section = 0
+    labels: frozenset[str] = frozenset()
+    next_labels: frozenset[str] = frozenset()
     for cell in read(source).cells:
         if cell.cell_type == "markdown":
-            # Every heading starts a section, to which the cells after it belong.
-            for part in re.split(r"(?m)^(?=#+ )", cell.source):
-                section += part.startswith("#")
+            # Every heading and every exercise starts a section, to which the cells after it belong.
+            for part in re.split(r"(?m)^(?=#+ |`{3,}\{exercise\})", cell.source):
+                if part.startswith(("#", "```")):
+                    section += 1
+                    labels = next_labels | {*re.findall(r"(?m)^:label: (.+)", part)}
+                # The label of a heading stands before it.
+                next_labels = frozenset(re.findall(r"\(([\w-]+)\)=\s*\Z", part))
                 numerals += numerals_of(part, section)
+                numbers += formula_numbers(part, section, labels)
         elif cell.cell_type == "code":
             codes.append(cell.source)
             where = f"cell {len(codes)}"
             # A cell that has not run yet has no outputs; pairs.py reports it.
             stored = next(outputs, nbformat.v4.new_code_cell())
-            picture = Facts(picture_facts(stored))
+            options = cell.metadata.get("mystnb", {})
+            own = frozenset([options.get("figure", {}).get("name", where)])
             for text in texts_of(cell):
                 for numeral in numerals_of(text, section):
-                    numerals.append(replace(numeral, picture=picture))
-            facts += code_facts(cell.source, where, section)
-            facts += output_facts(stored, where, section)
-    return numerals, facts + facts_of_sources(source, "\n".join(codes))
+                    numerals.append(replace(numeral, labels=numeral.labels | own))
+            # Sizes and limits of a picture are not what the text speaks of.
+            drawn = "figure" in options
+            code_section, code_labels = (-1, own) if drawn else (section, labels)
+            numbers += code_numbers(cell.source, where, code_section, code_labels)
+            numbers += output_numbers(stored, where, section, labels | own)
+            numbers += curve_numbers(stored, where, own)
+    return numerals, numbers + numbers_of_sources(source, "\n".join(codes))
 
 
-def share_of_others(numerals: list[Numeral], facts: Facts) -> float:
-    """Return how often another number in the place of a numeral would be traced as well."""
-    traces = [
-        trace(other, facts)
-        for numeral in numerals
-        if numeral.source.startswith(
-            ("code", "output", "picture", "published", "cited")
-        )
-        for other in others(numeral)
-    ]
-    good = [text for text in traces if text and not text.startswith("beside")]
-    return len(good) / max(len(traces), 1)
-
-
-def report(source: Path, known: list[dict[str, str]], show_all: bool) -> int:
-    """Print a chapter's numerals without a source, or all; return the number of faults."""
-    numerals, fact_list = read_chapter(source)
-    facts = Facts(fact_list)
-    phrases = [row for row in known if row["chapter"] == source.stem]
+def report(source: Path, show_all: bool) -> int:
+    """Print a chapter's numerals that are shown nowhere, or all; return their number."""
+    numerals, number_list = read_chapter(source)
+    numbers = Numbers(number_list)
     for numeral in numerals:
-        reasons = [
-            f"known: {row['reason']}"
-            for row in phrases
-            if row["phrase"] in numeral.sentence and numeral.text in row["phrase"]
-        ]
-        numeral.source = numeral.source or trace(numeral, facts) or "".join(reasons[:1])
+        numeral.source = numeral.source or numbers.source_of(numeral)
         if show_all or not numeral.source:
-            print(
-                f"{source.stem}: {numeral.text!r}: {numeral.source or 'UNTRACED'} "
-                f"| {numeral.sentence}"
-            )
-    prose = " ".join(numeral.sentence for numeral in numerals)
-    gone = [row["phrase"] for row in phrases if row["phrase"] not in prose]
-    for phrase in gone:
-        print(f"{source.stem}: numerals.csv lists a phrase that is gone: {phrase}")
-    counts = Counter(n.source.split(":")[0] or "untraced" for n in numerals)
+            place = numeral.source or "SHOWN NOWHERE"
+            print(f"{source.stem}: {numeral.text!r}: {place} | {numeral.sentence}")
+    counts = Counter(n.source.split(":")[0] or "shown nowhere" for n in numerals)
     summary = ", ".join(f"{count} {kind}" for kind, count in counts.most_common())
-    print(
-        f"{source.stem}: {len(numerals)} numerals: {summary}; of others in their place "
-        f"{share_of_others(numerals, facts):.0%} would be traced"
-    )
-    return counts["untraced"] + len(gone)
+    print(f"{source.stem}: {len(numerals)} numerals: {summary}")
+    return counts["shown nowhere"]
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(
-        description="Trace the numerals of the prose to their sources."
+        description="Find every number in the prose where it is shown."
     )
     parser.add_argument("chapters", nargs="*", help="names or numbers; all without one")
-    parser.add_argument("--all", action="store_true", help="list the traced ones too")
+    parser.add_argument("--all", action="store_true", help="list the found ones too")
     options = parser.parse_args()
-    with KNOWN.open(encoding="utf-8", newline="") as file:
-        known = list(csv.DictReader(file))
     sources = chosen(options.chapters)
-    return int(any([report(source, known, options.all) for source in sources]))
+    return int(any([report(source, options.all) for source in sources]))
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import nbformat
 
-from common import ROOT, chosen, fixed_environment
+from common import ROOT, chosen, end_with_children, fixed_environment
 
 PROBE_BLAS = """\
 import numpy, scipy.linalg, threadpoolctl
@@ -94,6 +94,7 @@ def main() -> int:
     )
     parser.add_argument("--jobs", type=int, default=2, help="chapters at a time")
     options = parser.parse_args()
+    end_with_children()
     notebooks = [source.with_suffix(".ipynb") for source in chosen(options.chapters)]
     # The largest first, so that no core idles at the end.
     notebooks.sort(key=lambda notebook: -notebook.stat().st_size)

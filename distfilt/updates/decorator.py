@@ -13,7 +13,7 @@ from collections.abc import Callable
 from functools import partial
 from inspect import signature
 from types import EllipsisType
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -310,7 +310,9 @@ def _draw_seed(rng: Rng) -> list[int]:
     They are those of two integers below 2^63, ``rng.integers(2**63, size=2)``, which numpy makes of
     raw draws of 64 bits without the lowest. Raw draws take a fraction of the time.
     """
-    first, second = rng.bit_generator.random_raw(2).tolist()
+    # All rows of a batch have the same words.
+    source = rng.batch if isinstance(rng, RowGenerator) else rng
+    first, second = source.bit_generator.random_raw(2).tolist()
     # Bits 1 to 32 and bits 33 to 63 of each.
     return [first // 2 % 2**32, first >> 33, second // 2 % 2**32, second >> 33]
 
@@ -339,6 +341,13 @@ def _stream(
     return RowGenerator(bits, lead, rows)
 
 
+def _with_key(bits: np.random.BitGenerator, rows: Indices) -> np.random.BitGenerator:
+    """Return a stream that belongs to some rows of a batch, from that of the batch."""
+    seeds = cast(np.random.SeedSequence, bits.seed_seq)
+    key = (*seeds.spawn_key, *rows.tolist())
+    return np.random.PCG64(np.random.SeedSequence(seeds.entropy, spawn_key=key))
+
+
 class RowGenerator(Rng):
     """A generator for a batch (*lead) that returns the draws of some of its rows.
 
@@ -364,10 +373,19 @@ class RowGenerator(Rng):
     def __init__(
         self, bits: np.random.BitGenerator, lead: tuple[int, ...], rows: Indices
     ) -> None:
-        super().__init__(bits)
         self.lead = lead
         self.rows = rows
         self.is_partial = rows.size != math.prod(lead)
+        # Draws that do not belong to rows, such as a seed, are other ones for other rows.
+        super().__init__(_with_key(bits, rows) if self.is_partial else bits)
+        self.batch = Rng(bits) if self.is_partial else self
+
+    def spawn(self, n_children: int) -> list[Rng]:
+        """Return generators for the same rows, each with a stream of its own."""
+        return [
+            RowGenerator(bits, self.lead, self.rows)
+            for bits in self.batch.bit_generator.spawn(n_children)
+        ]
 
     def permuted(
         self,
@@ -382,7 +400,7 @@ class RowGenerator(Rng):
             return super().permuted(x, axis=axis, out=out)
         # The whole batch is permuted, so that every row uses up its own draws.
         whole = self._fill_batch(values).reshape(-1, *values.shape[1:])
-        mixed = super().permuted(whole, axis=axis)[self.rows]
+        mixed = self.batch.permuted(whole, axis=axis)[self.rows]
         if out is None:
             return mixed
         out[...] = mixed
@@ -485,7 +503,10 @@ def _draw_rows(
         # All arguments by name, as numpy would bind them.
         bound = dict(zip(names, args, strict=False)) | options
         size = bound.get("size")
-        if size is None and by_row and bound.get("out") is None:
+        target = bound.get("out")
+        if size is None and target is not None:
+            shape = target.shape
+        elif size is None and by_row:
             # Without a size it is that of the parameters.
             shapes = [np.shape(bound[p]) for p in parameters if p in bound]
             shape = np.broadcast_shapes(*shapes)
@@ -500,7 +521,7 @@ def _draw_rows(
                 bound[p] = self._extend_parameter(bound[p], len(shape))
         bound["size"] = (*self.lead, *shape[1:])
         out = bound.pop("out", None)
-        draws = draw(self, **bound)
+        draws = draw(self.batch, **bound)
         # The batch's axes become one, of which `rows` are indices.
         batch_size = math.prod(self.lead)
         flat_draws = draws.reshape(batch_size, *draws.shape[len(self.lead) :])

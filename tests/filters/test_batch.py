@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -29,6 +29,7 @@ KINDS = [
     component([1], std=0.5),
     Sensor(2, lambda x: x @ SLANT.T, NOISE, linear=lambda d: SLANT),
 ]
+SCORES = ("log_likelihood", "nis", "n_observed")
 FAMILIES: dict[str, Any] = {
     "gaussian": GaussianFilter,
     "unscented": partial(GaussianFilter, linearization="unscented", kappa=0.5),
@@ -38,8 +39,18 @@ FAMILIES: dict[str, Any] = {
 }
 
 
-def batch(known: list[Any], times: Any, q: Any, run: Any) -> tuple[Any, Any]:
-    """Means (K, 2) and covariances (K, 2, 2) at all times, given the observations of one run."""
+class Law(NamedTuple):
+    """The joint Gaussian of the states at all times, and the rows of what was observed of them."""
+
+    mean: np.ndarray
+    cov: np.ndarray
+    h: np.ndarray
+    r: np.ndarray
+    y: np.ndarray
+
+
+def find_law(known: list[Any], times: Any, q: Any, run: Any) -> Law:
+    """Stack all times, K of them, and the observations (sensor, observation) of one run."""
     # x = L [x₀, w₁, …, w_K]: the row of x_k is F times that of x_{k-1}, plus w_k.
     lift = np.eye(2 * len(times))
     steps = np.diff(times)
@@ -71,6 +82,12 @@ def batch(known: list[Any], times: Any, q: Any, run: Any) -> tuple[Any, Any]:
         h = np.concatenate([h, rows[arrived]])
         r = block_diag(r, noise)
         y = np.concatenate([y, value[arrived]])
+    return Law(mean, cov, h, r, y)
+
+
+def batch(known: list[Any], times: Any, q: Any, run: Any) -> tuple[Any, Any]:
+    """Means (K, 2) and covariances (K, 2, 2) at all times, given the observations of one run."""
+    mean, cov, h, r, y = find_law(known, times, q, run)
     # K = P Hᵀ S⁻¹ with S = H P Hᵀ + R
     innovation_cov = h @ cov @ h.T + r
     gain = np.linalg.solve(innovation_cov, h @ cov).T
@@ -82,6 +99,17 @@ def batch(known: list[Any], times: Any, q: Any, run: Any) -> tuple[Any, Any]:
         block = slice(k, k + 2)
         blocks.append(cov[block, block])
     return mean.reshape(-1, 2), np.array(blocks)
+
+
+def score_jointly(known: list[Any], times: Any, q: Any, run: Any) -> np.ndarray:
+    """Log p(y), rᵀ S⁻¹ r and the number of all numbers y at once, of one run."""
+    mean, cov, h, r, y = find_law(known, times, q, run)
+    innovation_cov = h @ cov @ h.T + r
+    innovation = y - h @ mean
+    nis = innovation @ np.linalg.solve(innovation_cov, innovation)
+    _sign, log_volume = np.linalg.slogdet(innovation_cov)
+    evidence = -0.5 * (nis + log_volume + y.size * np.log(2 * np.pi))
+    return np.array([evidence, nis, y.size])
 
 
 def price(payload: list[Any], now: float) -> Any:
@@ -189,6 +217,25 @@ def check_beliefs(
             assert np.allclose(result, covs[place], atol=1e-9)
 
 
+def check_scores(
+    totals: dict[str, np.ndarray],
+    available: list[Any],
+    times: np.ndarray,
+    q: np.ndarray,
+    runs: tuple[int, ...],
+) -> None:
+    """Compare the sums of every agent's scores with those of all its observations at once.
+
+    By the chain rule p(y₁, y₂) = p(y₁) p(y₂ | y₁), in whatever order they come, and so for the
+    exponents of the densities.
+    """
+    for a, *run in np.ndindex(len(available), *runs):
+        expected = score_jointly(available[a], times, q, tuple(run))
+        index = (*run, a)
+        result = [totals[name][index] for name in SCORES]
+        assert np.allclose(result, expected, rtol=1e-9, atol=1e-8)
+
+
 def make_walk(q: np.ndarray) -> LinearModel:
     """Return the model with noise of the covariance dt (1 + t) q."""
     return LinearModel.from_transition(
@@ -230,7 +277,9 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
     nets = {}
     for t, adjacency in zip(times, links, strict=True):
         nets[t] = Graph.from_adjacency(adjacency, directed=True)
-    options: Any = {"lag": lag, "share_observations": share} if several else {}
+    options: Any = {}
+    if several:
+        options = {"lag": lag, "share_observations": share, "record_evidence": True}
     f = FAMILIES[family](
         walk, team, nets.get, exchange_interval=every or None, **options
     )
@@ -244,6 +293,7 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
     available = [[] for _ in team]
     waiting = [[] for _ in team]
     owed = np.zeros(agents)
+    totals = {name: np.zeros((*runs, agents)) for name in SCORES}
     state = f.start(prior, rng=rng, runs=runs, t=times[0])
     arrivals = [event[0] for event in events]
     for when in sorted({*range(1, steps + 1), *arrivals}):
@@ -270,3 +320,7 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
         views = [(then.t, f.summarize(then)) for then in states]
         assert len(views) == 1 + min(lag * several, k)
         check_beliefs(views, available, times[: k + 1], q, runs)
+        if several:
+            for name in SCORES:
+                totals[name] = totals[name] + getattr(state, name)
+            check_scores(totals, available, times[: k + 1], q, runs)

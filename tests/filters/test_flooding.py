@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.random import default_rng
 
-from distfilt.filters import GaussianFilter
+from distfilt.filters import EnsembleFilter, GaussianFilter, Observation
 from distfilt.network import Faults, Graph, graphs
-from distfilt.sensors import component
+from distfilt.sensors import component, distance
+from distfilt.updates import etkf, serially
 from tests.filters.families import FAMILIES, PRIOR, TIMES, data, model, still_model
 
 SHARING = [
@@ -167,3 +169,30 @@ def test_delayed_and_several_observations_are_flooded_too() -> None:
     assert np.array_equal(states[0].joint_means, states[1].joint_means)
     # All agents have all observations, assimilated in another order.
     assert np.abs(np.diff(states[0].means, axis=0)).max() < 1e-12
+
+
+@pytest.mark.parametrize(("graph", "hops"), [("complete", 1), ("path", "all")])
+def test_agents_that_have_all_observations_take_them_in_one_order(
+    graph: str, hops: Any
+) -> None:
+    """A serial square root depends on the order, so that one agent with all sensors tells it."""
+    sensors = [
+        component([0], std=0.5),
+        component([1], std=1.0),
+        distance([0, 1], std=0.3),
+    ]
+    values = [[0.4], [-0.8], [1.5]]
+    make = partial(
+        EnsembleFilter, members=8, update=serially(partial(etkf, rotation="none"))
+    )
+    members = default_rng(0).standard_normal((8, 2)) + [1.0, 0.5]
+    f = make(still_model(2), sensors, getattr(graphs, graph)(3), hops=hops)
+    state = f.step(f.start(members, rng=default_rng(0)), 1.0, values)
+    # The order of the agents is that of the sensors of one.
+    for order, is_right in (([0, 1, 2], True), ([1, 0, 2], False)):
+        one = make(still_model(2), [[sensors[k] for k in order]])
+        seen = [Observation(1.0, 0, values[k], n) for n, k in enumerate(order)]
+        alone = one.step(one.start(members, rng=default_rng(0)), 1.0, [seen])
+        for agent in range(3):
+            ours = state.ensembles[agent]
+            assert np.allclose(ours, alone.ensembles[0], atol=1e-12) == is_right

@@ -12,15 +12,21 @@ from typing import Any
 import numpy as np
 import pytest
 
+from distfilt.filters import EnsembleFilter, Observation
+from distfilt.models import Model
 from distfilt.network import Faults, Graph
 
 from .problems import (
     APART,
     CASES,
     TIMES,
+    Q,
     assert_equal,
     build,
+    differentiate_move,
     make_prior,
+    make_problem,
+    move,
     one_run,
     permute_agents,
     problem_of,
@@ -174,6 +180,167 @@ def test_a_list_of_events_in_two_calls_is_the_list_in_one(
         assert np.array_equal(expected.ledger.scalars, after.ledger.scalars)
 
 
+def make_model(d: int, now: float | None = None) -> Model:
+    """Return a model that moves faster with time; or its motion at one time, `now`, for ever."""
+
+    def stretch(t: float, dt: float) -> float:
+        start = t if now is None else now
+        return (1 + start) * dt
+
+    return Model(
+        d,
+        lambda x, t, dt: move(x, 0.0, stretch(t, dt)),
+        lambda t, dt: stretch(t, dt) * Q[:d, :d],
+        derivative=lambda x, t, dt: differentiate_move(x, 0.0, stretch(t, dt)),
+    )
+
+
+@ignore_collapse
+@each_case
+def test_a_step_has_the_model_of_the_time_at_which_it_begins(name: str) -> None:
+    """There a model that does not depend on time is put in its place, step by step."""
+    case = CASES[name]
+    problem = make_problem(case.d, graph=case.graph)
+    # A mixture looks at the model's derivative only where it splits.
+    splits = (
+        {"split_threshold": 0.01, "max_components": 16} if name == "mixture" else {}
+    )
+    f = build(case, replace(problem, model=make_model(case.d)), **splits)
+    prior = make_prior(case, problem)
+    start = f.start(prior, rng=np.random.default_rng(0))
+    state = start
+    for expected in f.steps(start, TIMES, problem.events):
+        frozen_model = make_model(case.d, state.t)
+        frozen = build(case, replace(problem, model=frozen_model), **splits)
+        events = [e for e in problem.events if e.t == expected.t]
+        (state,) = frozen.steps(state, [expected.t], events)
+        a = f.summarize(expected)
+        b = f.summarize(state)
+        assert np.allclose(a.mean, b.mean, rtol=1e-9, atol=1e-12)
+        assert np.allclose(a.variance, b.variance, rtol=1e-9, atol=1e-12)
+        if state.nis is not None:
+            assert np.allclose(expected.nis, state.nis, rtol=1e-9)
+
+
+@ignore_collapse
+@each_case
+def test_every_state_of_a_run_can_be_stepped_again(name: str) -> None:
+    """It keeps its beliefs and its generator, so that each attempt ends where the run went."""
+    case = CASES[name]
+    # With process noise members draw in every step.
+    problem = make_problem(case.d, graph=case.graph)
+    f = build(case, problem)
+    start = f.start(make_prior(case, problem), rng=np.random.default_rng(0))
+    state = start
+    for expected in f.steps(start, TIMES, problem.events):
+        now = [e for e in problem.events if e.t == expected.t]
+        listed = [[e for e in now if e.agent == agent] for agent in range(4)]
+        a = f.summarize(expected)
+        for _attempt in range(2):
+            b = f.summarize(f.step(state, expected.t, listed))
+            assert np.allclose(a.mean, b.mean, rtol=0, atol=1e-12)
+            assert np.allclose(a.variance, b.variance, rtol=0, atol=1e-12)
+        state = expected
+
+
+def spawning_forecast(x: Any, model: Any, t: float, dt: float, *, rng: Any) -> Any:
+    """Add draws of a stream of the forecast's own to the members."""
+    (stream,) = rng.spawn(1)
+    return x + stream.standard_normal(x.shape)
+
+
+@pytest.mark.parametrize("lag", [0, 1])
+def test_streams_that_a_forecast_spawns_are_those_of_its_step(lag: int) -> None:
+    """A second attempt at a step spawns the same stream, and the next step another one."""
+    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    f = EnsembleFilter(still, [None], members=5, forecast=spawning_forecast, lag=lag)
+    start = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
+    first = f.step(start, 1.0, [None])
+    again = f.step(start, 1.0, [None])
+    assert np.array_equal(first.ensembles, again.ensembles)
+    second = f.step(first, 2.0, [None])
+    draws = first.ensembles - start.ensembles
+    assert not np.allclose(draws, second.ensembles - first.ensembles)
+
+
+NUMBERS = ("rejected", "log_likelihood", "nis", "n_observed")
+WITH_LAG = [name for name, case in CASES.items() if "lag" in case.options]
+
+
+def delay(events: list[Observation]) -> tuple[list[Observation], list[Observation]]:
+    """Return the events that come in time, and the others with the time of their arrival.
+
+    Of the latter some come in the next step and some in the one after it, one at its very time
+    and one between two; the first to be observed is the last to arrive.
+    """
+    arrivals = {0: TIMES[3], 2: TIMES[1], 4: 0.75, 6: TIMES[2], 9: 1.1}
+    punctual = []
+    late = []
+    for k, event in enumerate(events):
+        if k in arrivals:
+            late.append(replace(event, arrival_time=arrivals[k]))
+        else:
+            punctual.append(event)
+    return punctual, late
+
+
+@ignore_collapse
+@pytest.mark.parametrize("name", WITH_LAG)
+def test_a_run_with_late_observations_is_its_steps(name: str) -> None:
+    """So is a smoothed one: the beliefs are those of later steps, but all counts the steps' own."""
+    case = CASES[name]
+    problem = problem_of(case)
+    f = build(case, problem, lag=3)
+    start = f.start(make_prior(case, problem), rng=np.random.default_rng(0))
+    punctual, late = delay(problem.events)
+    assert all(e.t < e.arrival_time for e in late)
+    # In the order of their arrival, each in the first step that is not before it
+    state = start
+    states = []
+    before = start.t
+    for t in TIMES.tolist():
+        listed = [[e for e in punctual if (e.t, e.agent) == (t, a)] for a in range(4)]
+        arrived = [e for e in late if before < e.arrival_time <= t]
+        arrived.sort(key=lambda e: e.arrival_time)
+        state = f.step(state, t, listed, delayed=arrived)
+        states.append(state)
+        before = t
+    run = f.run(start, TIMES, punctual, delayed=late[::-1])
+    smooth = f.smooth(start, TIMES, punctual, delayed=late[::-1])
+    smoothed = [*states[-1].lagged_states, states[-1]]
+    for k, one in enumerate(states):
+        for record_, belief in ((run, one), (smooth, smoothed[k])):
+            summary = f.summarize(belief)
+            assert np.allclose(record_["mean"][k], summary.mean, rtol=0, atol=1e-9)
+            variance = record_["variance"][k]
+            assert np.allclose(variance, summary.variance, rtol=0, atol=1e-9)
+            total = record_["scalars_total"][k]
+            assert np.array_equal(total, one.ledger.scalars)
+            for number in NUMBERS:
+                if number in record_:
+                    expected = getattr(one, number)
+                    assert np.allclose(record_[number][k], expected, atol=1e-9)
+
+
+@ignore_collapse
+@each_case
+def test_a_run_counts_from_its_own_start(name: str) -> None:
+    """Messages of a run that goes on from another: of each step its own, in total those of both."""
+    case = CASES[name]
+    problem = problem_of(case)
+    f = build(case, problem)
+    start = f.start(make_prior(case, problem), rng=np.random.default_rng(0))
+    whole = f.run(start, TIMES, problem.events)
+    early = [e for e in problem.events if e.t < TIMES[2]]
+    late = [e for e in problem.events if e.t >= TIMES[2]]
+    between = f.final_state(f.run(start, TIMES[:2], early))
+    rest = f.run(between, TIMES[2:], late)
+    for number in ("messages", "scalars", "bytes", "rounds"):
+        for variable in (number, f"{number}_total"):
+            assert np.array_equal(rest[variable], whole[variable][2:])
+    assert rest["scalars"].values.sum() > 0
+
+
 @ignore_collapse
 @each_case
 def test_the_numbers_of_agents_are_names(name: str) -> None:
@@ -226,3 +393,27 @@ def test_units_of_single_components_change_nothing(name: str) -> None:
     scores = [n for n in ("rejected", "log_likelihood", "nis") if n in a]
     for score in scores:
         assert np.allclose(a[score], b[score], rtol=1e-5, atol=1e-6)
+
+
+@ignore_collapse
+@pytest.mark.parametrize("name", [n for n in WITH_LAG if "waiting" not in n])
+def test_a_filter_without_lag_drops_the_past_when_time_goes_on(name: str) -> None:
+    """In a step of no length it keeps the past of its state, as a filter with a lag does."""
+    case = CASES[name]
+    problem = problem_of(case)
+    f = build(case, problem, lag=3)
+    g = f.replace(lag=0)
+    start = f.start(make_prior(case, problem), rng=np.random.default_rng(0))
+    *_, state = f.steps(
+        start, TIMES[:2], [e for e in problem.events if e.t <= TIMES[1]]
+    )
+    more = [[Observation(TIMES[1], 0, [0.9])], [], [], []]
+    a = f.step(state, TIMES[1], more)
+    b = g.step(state, TIMES[1], more)
+    assert b.times == a.times == (0.0, TIMES[0])
+    for one, other in zip((*a.lagged_states, a), (*b.lagged_states, b), strict=True):
+        first = f.summarize(one)
+        second = g.summarize(other)
+        assert np.array_equal(first.mean, second.mean)
+        assert np.array_equal(first.variance, second.variance)
+    assert g.step(b, TIMES[2], [None] * 4).times == ()

@@ -266,6 +266,31 @@ def test_particles_that_contradict_an_observation_have_little_weight() -> None:
     assert (f.summarize(state).mean > 0.7).all()
 
 
+def test_particles_without_weight_do_not_matter_wherever_they_are() -> None:
+    """Five of them are put among the others or far away: no fit and no weight depends on it."""
+    sensors = [distance([0], std=0.5, origin=[-3.0])] + [None] * 4
+    options = {"sensors": sensors, "model": still_model(1), "ess_threshold": 0.0}
+    f = make(
+        LikelihoodConsensusFilter,
+        basis=PolynomialBasis([0]),
+        jitter=0.0,
+        **options,
+    )
+    start = f.start(([0.5], [[1.0]]), rng=default_rng(0))
+    logs = start.log_weights.copy()
+    logs[:, :5] = -1e300
+    logs[:, 5:] = -np.log(395)
+    after = []
+    for place in (0.0, 40.0):
+        x = start.particles.copy()
+        x[:, :5] = place
+        state = start.replace(particles=x, log_weights=logs)
+        after.append(f.step(state, 1.0, [[4.1], None, None, None, None]))
+    assert (after[0].weights[:, :5] == 0).all()
+    assert np.allclose(after[0].weights, after[1].weights, rtol=1e-9, atol=0)
+    assert not np.allclose(after[0].weights, start.weights, rtol=0.1)
+
+
 def test_gate_losses_runs_and_failures() -> None:
     _, seen = data(team(), (3,))
     # One observation of one run is far off.

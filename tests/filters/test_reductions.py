@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from distfilt import filters, network
 from distfilt.density import Grid
 from distfilt.filters import Observation
 from distfilt.models import LinearModel, Model
 from distfilt.network import graphs
-from distfilt.sensors import LikelihoodSensor, Sensor, component, increment
+from distfilt.sensors import LikelihoodSensor, Sensor, component, increment, wrap
 from distfilt.updates import etkf
 
 from .problems import (
@@ -335,10 +335,14 @@ def as_likelihood(sensor: Sensor) -> Sensor:
     noise = sensor.noise_cov
 
     def log_likelihood(x: Array, y: Array) -> Array:
-        # log N(y; h(x), R) = -½ (rᵀ R⁻¹ r + log |2 π R|)
-        residual = y - sensor.h(x)
-        solved = np.linalg.solve(noise, residual[..., None])[..., 0]
-        log_volume = np.linalg.slogdet(2 * np.pi * noise)[1]
+        # log N(y; h(x), R) = -½ (rᵀ R⁻¹ r + log |2 π R|) of the numbers that are there
+        missing = np.isnan(y)
+        residual = np.where(missing, 0.0, y - sensor.h(x))
+        # Missing ones have a variance of 1 / (2 π) of their own, of which nothing depends.
+        is_pair = ~missing[..., :, None] & ~missing[..., None, :]
+        cov = np.where(is_pair, noise, np.eye(sensor.dim) / (2 * np.pi))
+        solved = np.linalg.solve(cov, residual[..., None])[..., 0]
+        log_volume = np.linalg.slogdet(2 * np.pi * cov)[1]
         return -0.5 * ((residual * solved).sum(axis=-1) + log_volume)
 
     def moments(x: Array) -> tuple[Array, Array]:
@@ -354,15 +358,19 @@ def straighten(sensor: Sensor, d: int) -> Sensor:
     return Sensor(sensor.dim, lambda x: x @ H.T, sensor.noise_cov)
 
 
+@pytest.mark.parametrize("has_gaps", [False, True])
 @pytest.mark.parametrize(
     "name", ["particle", "transport", "grid", "likelihood consensus"]
 )
-def test_a_density_as_a_function_is_the_sensor_with_its_noise(name: str) -> None:
+def test_a_density_as_a_function_is_the_sensor_with_its_noise(
+    name: str, has_gaps: bool
+) -> None:
     """Also of several sensors of an agent; its gate and its NIS have the moments."""
     case = CASES[name]
     problem = make_problem(case.d, noise=case.noise, graph=case.graph)
-    present = [e for e in problem.events if not np.isnan(e.value).any()]
-    problem = replace(problem, events=present)
+    if not has_gaps:
+        present = [e for e in problem.events if not np.isnan(e.value).any()]
+        problem = replace(problem, events=present)
     if name == "likelihood consensus":
         # It approximates predictions of one, densities of the other, both exactly if linear.
         team = change_sensors(problem.sensors, partial(straighten, d=case.d))
@@ -468,3 +476,60 @@ def test_scores_of_a_late_and_a_present_observation_add_up(make: Any) -> None:
     far = replace(late, value=np.array([60.0]))
     assert np.array_equal(step(50.0, far, gate_probability=0.99).rejected, [2.0])
     assert np.array_equal(step(0.1, far, gate_probability=0.99).rejected, [1.0])
+
+
+@pytest.mark.filterwarnings("ignore:observations must be predicted to be used")
+@pytest.mark.parametrize(
+    "make",
+    [
+        partial(filters.GaussianFilter, linearization="unscented"),
+        partial(filters.EnsembleFilter, members=20),
+        partial(filters.ParticleFilter, members=20),
+        partial(filters.TransportFilter, members=20),
+    ],
+)
+def test_unseen_observations_of_a_step_add_up_and_belong_to_it(make: Any) -> None:
+    """A late and a present one are two; smoothed beliefs are later ones, but not their counts."""
+    walk = Model(1, lambda x, t, dt: x, lambda t, dt: dt * np.eye(1))
+    # Beyond all that the prior N(0, 1) and the noise make likely
+    blind = Sensor(1, lambda x: np.where(x > 50, x, np.nan), [[1.0]])
+    f = make(walk, [blind], lag=1)
+    start = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
+    present = [Observation(2.0, 0, [1.3])]
+    late = [Observation(1.0, 0, [-0.4], arrival_time=2.0)]
+    for call in (f.run, f.smooth):
+        record_ = call(start, [1.0, 2.0, 3.0], present, delayed=late)
+        assert record_["unseen"].values[:, 0].tolist() == [0.0, 2.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        partial(filters.ParticleFilter, members=50, ess_threshold=0.0),
+        partial(filters.TransportFilter, members=20),
+    ],
+)
+def test_a_compass_as_a_density_is_tested_the_shorter_way_round(make: Any) -> None:
+    """Headings on both sides of ±π: its gate and its NIS are those of a sensor with a period."""
+    turn = (2 * np.pi,)
+    rest = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)), periods=turn)
+    plain = Sensor(1, lambda x: x, [[0.04]], periods=turn)
+
+    def log_likelihood(x: Array, y: Array) -> Array:
+        return norm.logpdf(wrap(y - x)[..., 0], scale=0.2)
+
+    def moments(x: Array) -> tuple[Array, Array]:
+        return x, np.full((*x.shape, 1), 0.04)
+
+    density = LikelihoodSensor(1, log_likelihood, moments=moments, periods=turn)
+    runs = []
+    for sensor in (plain, density):
+        f = make(rest, [sensor], gate_probability=0.99, record_evidence=True)
+        start = f.start(([3.1], [[0.04]]), rng=np.random.default_rng(0))
+        # Both ways round 3.1 is near -3.1 and far from 0.5.
+        runs.append(f.run(start, [1.0, 2.0, 3.0], [[[-3.1], [0.5], [3.0]]]))
+    a, b = runs
+    assert a["rejected"].values.ravel().tolist() == [0.0, 1.0, 0.0]
+    assert_equal(a, b, ("mean", "variance", "rejected", "n_observed"))
+    # The variance of 20 members of equal weights is divided by 19 or by 20.
+    assert np.allclose(a["nis"], b["nis"], rtol=1 / 19)

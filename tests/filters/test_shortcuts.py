@@ -209,6 +209,42 @@ def test_events_that_do_not_fit_are_refused(events: Any, words: str) -> None:
         f.step(f.start(PRIOR), 1.0, [events, []])
 
 
+def test_an_event_has_the_size_of_its_own_sensor() -> None:
+    """Of an agent with sensors of two numbers and of one, in either order."""
+    sensors = [component([0, 1], std=1.0), component([2], std=1.0)]
+    for k, team in enumerate((sensors, sensors[::-1])):
+        f = GaussianFilter(constant_velocity(sigma=0.1), [team])
+        start = f.start(PRIOR)
+        for value, number in (([1.0], k), ([1.0, 2.0], 1 - k)):
+            event = Observation(1.0, 0, value, number)
+            with pytest.raises(ValueError, match="must have shape"):
+                f.step(start, 1.0, [[event]])
+            with pytest.raises(ValueError, match="must have shape"):
+                f.run(start, None, [event])
+
+
+def test_an_event_that_arrives_later_is_refused_however_it_comes() -> None:
+    """Assimilated at its own time, it would be used before anybody knows it."""
+    f = GaussianFilter(
+        constant_velocity(sigma=0.1),
+        [component([0], std=1.0)] * 2,
+        share_observations=False,
+    )
+    start = f.start(PRIOR)
+    (late,) = _events([1.0], arrival_time=2.0)
+    calls = (
+        lambda: f.step(start, 1.0, [[late], []]),
+        lambda: f.step(start, 1.0, [late]),
+        lambda: f.run(start, None, [late]),
+        lambda: f.run(start, [1.0, 3.0], [late]),
+        lambda: f.run(start, [1.0], [[[late]], None]),
+        lambda: list(f.steps(start, None, [late])),
+    )
+    for call in calls:
+        with pytest.raises(ValueError, match="must have arrived by t = 1"):
+            call()
+
+
 def test_a_missing_event_is_none() -> None:
     """An event of NaN alone changes nothing but the forecast."""
     f = GaussianFilter(constant_velocity(sigma=0.1), [component([0], std=1.0)])

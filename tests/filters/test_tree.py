@@ -102,6 +102,23 @@ def test_all_agents_become_the_central_filter(tree: Graph) -> None:
     assert (wrong_traces < 0.5 * np.trace(cov)).all()
 
 
+def test_links_are_inflated_as_the_agents_are() -> None:
+    """All information of a state at rest is divided by the same number: that of the links too."""
+    tree = graphs.path(2)
+    team = [component([0], std=0.6), component([0], std=1.0)]
+    f = ChannelFilter(still_model(1), team, tree, inflation=1.2)
+    g = GaussianFilter(still_model(1), team, tree, inflation=1.2)
+    prior = ([0.0], [[1.0]])
+    a = f.start(prior)
+    b = g.start(prior)
+    for t in (1.0, 2.0, 3.0):
+        a = f.step(a, t, [[t], [-t]])
+        b = g.step(b, t, [[t], [-t]])
+        # Neighbours have all information at once, as if they sent each other observations.
+        assert np.allclose(a.means, b.means, rtol=1e-12)
+        assert np.allclose(a.covariances, b.covariances, rtol=1e-12)
+
+
 @each_tree
 def test_information_travels_one_link_a_step(tree: Graph) -> None:
     """One observation each; after k steps an agent has those of k links away."""

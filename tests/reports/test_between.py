@@ -249,3 +249,21 @@ def test_times_outside_are_refused_by_name() -> None:
     )
     with pytest.raises(ValueError, match="agents that exchange at intervals"):
         h.step(h.start(PRIOR), 1.0, [None, None], delayed=[Observation(0.5, 0, [0.0])])
+
+
+def test_a_late_time_that_is_rounded_otherwise_is_the_one_that_is_kept() -> None:
+    """0.1 + 0.2 is not 0.3, but neither is it a time between two steps."""
+    f = filters.GaussianFilter(MOTION, [EYE], lag=2)
+    start = f.start(PRIOR)
+    rounded = 0.1 + 0.2
+    assert rounded != 0.3
+    ends = []
+    for stepped, observed in ((0.3, 0.3), (0.3, rounded), (rounded, 0.3)):
+        state = f.step(f.step(start, stepped, [None]), 1.0, [[0.8]])
+        late = Observation(observed, 0, [1.1])
+        state = f.step(state, 1.0, [None], delayed=[late])
+        assert state.times == (0.0, stepped)
+        ends.append(state.joint_means)
+    in_order = f.step(f.step(start, 0.3, [[1.1]]), 1.0, [[0.8]])
+    for end in ends:
+        assert np.allclose(end, in_order.joint_means, atol=1e-12)

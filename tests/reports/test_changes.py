@@ -145,6 +145,25 @@ def test_two_rates_beside_a_beacon(family: str, lost: tuple[float, ...]) -> None
 
 
 @EACH
+def test_a_late_beacon_beside_a_present_odometer(family: str) -> None:
+    """It is of an earlier time: the odometer's change is still compared with its own last one."""
+    make, tolerance = FAMILIES[family]
+    f = make(WALK, [SENSORS], lag=1)
+    events = make_events()
+    punctual = []
+    late = []
+    for one in observations(events):
+        # Of odd seconds it comes one later, together with the odometer's.
+        if one.sensor == 2 and one.t % 2 == 1:
+            late.append(one.replace(arrival_time=one.t + 1.0))
+        else:
+            punctual.append(one)
+    start = f.start(PRIOR, rng=np.random.default_rng(1))
+    times = np.arange(1.0, 13.0)
+    check(f.run(start, times, punctual, delayed=late), events, tolerance)
+
+
+@EACH
 def test_a_slow_odometer_and_a_fast_beacon(family: str) -> None:
     """The case of the review: 2 m in 2 s are no 2 m/s."""
     make, _ = FAMILIES[family]

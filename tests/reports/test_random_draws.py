@@ -8,14 +8,20 @@
 | Bears-R-Us/arkouda 3322 | draws that depend on how the work is divided |
 | cubed-dev/cubed 4 | a stream for each chunk |
 | own | parameters for each run, permutations, results in place |
+| ICTP/RegCM 10, SciML/DifferentialEquations.jl 1034 | seeds that are drawn, one for a whole group |
+| own | generators that are made of the generator: spawned, wrapped, of scipy |
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import qmc
+from scipy.stats import t as student
 
 from distfilt.filters import EnsembleFilter
 from distfilt.sensors import Sensor
@@ -161,3 +167,73 @@ def test_runs_of_a_filter_have_their_own_draws(name: str, stacks: bool) -> None:
     # No two runs have the same changes of their members.
     for a, b in ((0, 1), (0, 2), (1, 2)):
         assert (np.abs(after[a] - after[b]) > 1e-9).any()
+
+
+def fill(rng: Any, shape: Any) -> np.ndarray:
+    numbers = np.empty(shape)
+    rng.standard_normal(out=numbers)
+    return numbers
+
+
+def mix(rng: Any, shape: Any) -> np.ndarray:
+    numbers = np.linspace(-1.0, 1.0, math.prod(shape))
+    rng.shuffle(numbers)
+    return numbers.reshape(shape)
+
+
+def sobol(rng: Any, shape: Any) -> np.ndarray:
+    numbers: np.ndarray = qmc.Sobol(1, rng=rng).random(128)[: math.prod(shape)]
+    return numbers.reshape(shape)
+
+
+def seeded(rng: Any, shape: Any) -> np.ndarray:
+    seed = int(rng.integers(2**31))
+    return np.random.default_rng(seed).standard_normal(shape)
+
+
+WAYS: dict[str, Callable[..., Any]] = {
+    "in place": fill,
+    "shuffled": mix,
+    "seed": seeded,
+    "spawned": lambda rng, shape: rng.spawn(1)[0].standard_normal(shape),
+    "wrapped": lambda rng, shape: np.random.default_rng(rng).standard_normal(shape),
+    "same bits": lambda rng, shape: np.random.Generator(rng.bit_generator).random(
+        shape
+    ),
+    "scipy": lambda rng, shape: student.rvs(4, size=shape, random_state=rng),
+    "sobol": sobol,
+}
+
+
+@pytest.mark.parametrize("name", WAYS)
+def test_generators_that_are_made_of_the_generator(name: str) -> None:
+    """Runs that miss different components share no draws, whichever way they are made."""
+
+    def add_noise(x: Any, h: Any, y: Any, r: Any, *, rng: Any) -> Any:
+        return x + WAYS[name](rng, x.shape)
+
+    x = np.zeros((2, 30, 1))
+    h = np.zeros((2, 30, 2))
+    y = np.array([[1.0, np.nan], [np.nan, 1.0]])
+    first, second = with_missing(
+        add_noise, x, h, y, np.eye(2), rng=np.random.default_rng(0)
+    )
+    assert first.std() > 0.1 and second.std() > 0.1
+    assert (first != second).sum() > 20
+    again = with_missing(add_noise, x, h, y, np.eye(2), rng=np.random.default_rng(0))
+    assert np.array_equal(again[0], first)
+
+
+@pytest.mark.parametrize("name", ["in place", "spawned"])
+def test_such_draws_do_not_depend_on_what_the_others_miss(name: str) -> None:
+    def add_noise(x: Any, h: Any, y: Any, r: Any, *, rng: Any) -> Any:
+        return x + WAYS[name](rng, x.shape)
+
+    x = np.zeros((2, 30, 1))
+    h = np.zeros((2, 30, 2))
+    both = np.array([[1.0, np.nan], [1.0, np.nan]])
+    results = [
+        with_missing(add_noise, x, h, y, np.eye(2), rng=np.random.default_rng(0))
+        for y in (both, np.array([[1.0, np.nan], [np.nan, 1.0]]))
+    ]
+    assert np.array_equal(results[0][0], results[1][0])

@@ -157,6 +157,9 @@ def test_a_failed_run_of_members_has_no_score_and_gaps_have_none() -> None:
     assert np.allclose(record["crps"].values[..., 0, 0], expected, equal_nan=True)
     is_missing = np.isnan(record["squared_error"].values[..., 0, 0])
     assert np.array_equal(is_missing, np.isnan(expected))
+    # Nothing was left out in the first run; of the failed one nobody knows.
+    unseen = np.array([[0.0, 0.0], [0.0, np.nan], [0.0, np.nan]])
+    assert np.array_equal(record["unseen"].values[..., 0], unseen, equal_nan=True)
 
 
 def test_scored_components_bridge_gaps_of_the_others() -> None:

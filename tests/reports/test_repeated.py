@@ -101,6 +101,24 @@ def test_the_same_observation_twice(family: str, copied: Any, way: str) -> None:
     assert (twice == once).all()
 
 
+def test_a_value_that_is_seen_again_at_another_time_counts() -> None:
+    """Of a state at rest: with R = P = 1 the mean is the sum of n values over n + 1."""
+    f = GaussianFilter(still_model(1), [[EYE, component([0], std=1.0)]], lag=3)
+    scale = EYE.noise_cov[0, 0]
+    state = f.start(([0.0], [[scale]]))
+    with warnings.catch_warnings(action="error"):
+        state = f.step(state, 1.0, [[Observation(1.0, 0, [0.3])]])
+        # Beside another observation, and beside a late one
+        both = [Observation(2.0, 0, [0.3]), Observation(2.0, 0, [0.7], 1)]
+        state = f.step(state, 2.0, [both])
+        late = Observation(2.0, 0, [0.9])
+        state = f.step(state, 3.0, [[Observation(3.0, 0, [0.3])]], delayed=[late])
+    values = np.array([0.3, 0.3, 0.3, 0.9])
+    precision = 1 / scale + values.size / scale + 1.0
+    expected = (values.sum() / scale + 0.7) / precision
+    assert np.isclose(state.means[0, 0], expected, rtol=1e-9)
+
+
 @EACH
 def test_a_step_that_is_repeated_at_its_own_time(family: str) -> None:
     f = FAMILIES[family](WALK, [EYE])
@@ -109,6 +127,12 @@ def test_a_step_that_is_repeated_at_its_own_time(family: str) -> None:
         repeated = f.step(state, 1.0, [np.array([0.3])])
     # A second step to the same time, without an observation
     nothing = f.step(state, 1.0, [None])
+    assert (means(f, repeated) == means(f, nothing)).all()
+    # Another observation of that time in between does not make it a new one.
+    between = f.step(state, 1.0, [[0.8]])
+    with pytest.warns(RuntimeWarning, match="sensor 0 at t = 1 s twice"):
+        repeated = f.step(between, 1.0, [np.array([0.3])])
+    nothing = f.step(between, 1.0, [None])
     assert (means(f, repeated) == means(f, nothing)).all()
 
 

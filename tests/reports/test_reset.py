@@ -88,6 +88,20 @@ def test_a_reset_leaves_the_other_components(family: str) -> None:
         assert (state.belief[..., 0] == start.belief[..., 0]).all()
 
 
+@pytest.mark.parametrize("family", FAMILIES)
+def test_value_and_covariance_are_in_the_order_of_the_components(family: str) -> None:
+    """Var(landmark) = 4, Var(speed) = 1 and their covariance 1.8, in whatever order they come."""
+    f = FAMILIES[family](STILL, EYES, graphs.path(2))
+    start = f.start(PRIOR, rng=np.random.default_rng(0))
+    cov = np.array([[4.0, 1.8], [1.8, 1.0]])
+    state = f.reset(start, ["landmark", "speed"], [7.0, -1.0], cov)
+    mean, after = moments(f, state, 0)
+    expected = np.array([[4.0, 0.0, 0.0], [0.0, 1.0, 1.8], [0.0, 1.8, 4.0]])
+    close = 1e-9 if hasattr(state, "means") else 0.1
+    assert np.allclose(mean, [3.0, -1.0, 7.0], atol=close)
+    assert np.allclose(after, expected, atol=close)
+
+
 @pytest.mark.parametrize("family", [name for name in FAMILIES if name != "transport"])
 def test_one_agent_restarts_alone(family: str) -> None:
     f = FAMILIES[family](STILL, EYES, graphs.path(2))

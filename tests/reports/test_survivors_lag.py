@@ -64,6 +64,20 @@ def test_the_past_of_fused_headings_turns_with_them(family: str) -> None:
     assert np.allclose(pasts[1], pasts[0], rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("family", PAST_FILTERS)
+def test_two_headings_fuse_the_shorter_way_whatever_the_others_are(family: str) -> None:
+    """At ±2.5 rad they are 1.28 rad apart about π, though all agents together look to zero."""
+    rest = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)), periods=(TURN,))
+    f: Any = PAST_FILTERS[family](rest, [None] * 5, graphs.path(5))
+    prior = [([mean], [[0.04]]) for mean in (0.0, 0.0, 0.0, 2.5, -2.5)]
+    start = f.start(prior, rng=np.random.default_rng(0))
+    after = f.summarize(f.step(start, 1.0, [None] * 5))
+    # The last agent has one neighbour: with equal covariances they meet halfway.
+    close = 1e-9 if family == "gaussian" else 4 * 0.2 / np.sqrt(4000)
+    assert abs(wrap(after.mean[4, 0] - np.pi)) < close
+    assert np.isclose(after.mean[0, 0], 0.0, atol=close)
+
+
 def test_a_step_of_no_length_separates_no_copies_of_a_model_with_noise() -> None:
     """Q = dt is zero there, but the next step has noise: the copies remain copies."""
     walk = still_model(1, rate=1.0)

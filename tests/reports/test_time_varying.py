@@ -9,6 +9,7 @@ The right value is a product of matrices, or a Kalman filter written out.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,8 @@ import pytest
 
 from distfilt import filters
 from distfilt.kalman import kalman_filter
-from distfilt.models import LinearModel, simulate
-from distfilt.sensors import Sensor
+from distfilt.models import LinearModel, Model, simulate
+from distfilt.sensors import Sensor, wrap
 
 TIMES = np.array([0.5, 1.5, 2.0, 3.5])
 SEEN = np.array([[1.0], [0.5], [0.2], [0.9]])
@@ -71,6 +72,38 @@ def test_filters_are_the_kalman_filter(linearization: Any) -> None:
         start = h.start(PRIOR, rng=np.random.default_rng(0))
         drawn = h.run(start, TIMES, [SEEN])
         assert np.allclose(drawn["mean"].values[:, 0], exact.means, atol=0.04)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        filters.GaussianFilter,
+        partial(filters.GaussianFilter, linearization="unscented"),
+        partial(filters.GaussianSumFilter, linearization="unscented"),
+        partial(filters.MixtureFilter, target_dim=1),
+        partial(filters.EnsembleFilter, members=20),
+        partial(filters.ParticleFilter, members=20),
+        partial(filters.TransportFilter, members=20),
+    ],
+)
+def test_a_heading_turns_at_the_rate_of_the_time_at_which_a_step_begins(
+    make: Any,
+) -> None:
+    """At (1 + t) rad/s from 0 to 0.5 s and then to 2 s: by 1 · 0.5 + 1.5 · 1.5 = 2.75 rad."""
+    model = Model(
+        1,
+        lambda x, t, dt: x + (1 + t) * dt,
+        lambda t, dt: np.zeros((1, 1)),
+        periods=(2 * np.pi,),
+    )
+    f = make(model, [None])
+    start = f.start(([2.0], [[0.04]]), rng=np.random.default_rng(0))
+    *_, last = f.steps(start, [0.5, 2.0], [None])
+    # Members have a mean of their own, and all turn by the same angle.
+    before = f.summarize(start)
+    after = f.summarize(last)
+    assert np.allclose(wrap(after.mean - before.mean - 2.75), 0.0, atol=1e-12)
+    assert np.allclose(after.variance, before.variance, rtol=1e-9)
 
 
 def test_a_matrix_with_options_is_still_one_of_dt() -> None:

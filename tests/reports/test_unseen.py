@@ -101,7 +101,7 @@ def test_the_others_leave_out_count_and_say_so_once(make: Any) -> None:
     rng = np.random.default_rng(0)
     with pytest.warns(RuntimeWarning, match=MESSAGE) as caught:
         run = f.run(f.start(PRIOR, rng=rng), TIMES, [Y])
-    assert len(caught) == 1
+    assert sum(MESSAGE in str(w.message) for w in caught) == 1
     assert (run["unseen"].values == 1).all()
     # The mean stays at the prior's, but for the draws of the members.
     assert run["mean"].values[-1, 0, 0] == pytest.approx(4.0, abs=0.7)

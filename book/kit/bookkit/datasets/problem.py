@@ -17,9 +17,9 @@ from distfilt.filters import GaussianFilter, GaussianState, Observation
 from distfilt.sensors import (
     Sensor,
     distance,
+    locate_sighting,
     range_bearing,
-    sighted_cov,
-    sighted_place,
+    sighting_cov,
     wrap,
 )
 
@@ -186,14 +186,14 @@ def follow_sightings(
             if subject not in candidates:
                 continue
             pose = [*places[robot], places[robot][1] + 1]
-            locate = partial(sighted_place, value=value, observer=pose)
+            locate = partial(locate_sighting, value=value, observer=pose)
             place = locate(state.means[0])
             if np.linalg.norm(place - candidates[subject]) > nearest:
                 candidates[subject] = place
                 continue
             del candidates[subject]
             noise_cov = sensors[robot, subject].noise_cov
-            cov = sighted_cov(state.means[0], value, noise_cov, observer=pose)
+            cov = sighting_cov(state.means[0], value, noise_cov, observer=pose)
             state = f.reset(state, places[subject], locate, cov)
         yield step, state
 
