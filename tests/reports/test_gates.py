@@ -272,6 +272,19 @@ def test_the_covariance_of_a_lost_track_stays_small_as_the_warning_says() -> Non
     assert np.isclose(run["variance"].values[-1, 0, 0], 1 + 20 * 0.01)
 
 
+def test_a_run_that_has_failed_rejects_nothing() -> None:
+    """It is left alone: no count, and no warning after ten."""
+    f = filters.GaussianFilter(WALK, [EYE], gate_probability=0.999, on_error="keep")
+    start = f.start(PRIOR, runs=(2,))
+    start = start.replace(failed=np.array([False, True]))
+    times = np.arange(1.0, LIMIT + 3.0)
+    # By time and run: near in the first, far in the second
+    values = np.tile(np.array([NEAR, FAR]), (times.size, 1, 1))
+    with warnings.catch_warnings(action="error"):
+        run = f.run(start, times, [values])
+    assert not (run["rejected"].values > 0).any()
+
+
 def test_a_healthy_run_is_not_bothered() -> None:
     """A gate of 0.9 rejects one in ten: ten in a row have a chance of 1e-10 a step."""
     rng = np.random.default_rng(0)

@@ -180,3 +180,32 @@ def test_a_state_keeps_its_ancestors(tmp_path: Any) -> None:
     f = ParticleFilter(model, [component([0], std=0.3)], members=300)
     after = [f.step(s, state.t + 1.0, [None]) for s in (state, loaded)]
     assert np.array_equal(after[0].particles, after[1].particles)
+
+
+def test_few_ancestors_of_a_run_that_has_failed_are_no_alarm() -> None:
+    """Control: the same particles warn in a run that has not failed."""
+    f = ParticleFilter(
+        wander(1e-6, constant=True),
+        [component([0], std=0.3)],
+        members=200,
+        on_error="keep",
+    )
+    prior = (np.zeros(2), np.eye(2))
+    start = f.start(prior, rng=np.random.default_rng(0), runs=(2,))
+    ancestors = np.tile(np.arange(200), (2, 1, 1))
+    particles_ = start.particles.copy()
+    log_weights = start.log_weights.copy()
+    # In the second run all particles have one of two ancestors, and fifty have all the weight.
+    ancestors[1] = np.repeat([0, 100], 100)
+    particles_[1] = np.repeat([[0.0, 0.0], [1.0, 1.0]], 100, axis=0)
+    particles_[1] += 1e-6 * np.arange(200)[:, None]
+    log_weights[1] = -1e300
+    log_weights[1, :, ::4] = -np.log(50)
+    state = start.replace(
+        particles=particles_, log_weights=log_weights, ancestors=ancestors
+    )
+    with pytest.warns(ParticleCollapse, match="descend from few"):
+        f.step(state, 1.0, [None])
+    failed = state.replace(failed=np.array([False, True]))
+    with warnings.catch_warnings(action="error"):
+        f.step(failed, 1.0, [None])
