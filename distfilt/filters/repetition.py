@@ -12,18 +12,21 @@ from ..sensors import Sensor
 from ..validation import Array
 from .observations import Observation
 
-__all__ = ["Assimilated", "drop_repeated", "is_equal_value"]
+__all__ = ["Assimilated", "WithoutRepeats", "drop_repeated", "is_equal_value"]
 
 Assimilated = tuple[float, int, int | Sensor, Array, tuple[float, ...]]
 """Time, agent, sensor (its number, or itself), value and metadata of an observation."""
 
 
 class WithoutRepeats(NamedTuple):
-    """Present and delayed observations without repetitions, and those that were left out."""
+    """Observations of which each is there once, and those that were left out."""
 
     observations: list[list[Observation]]
+    """Those of the present time, for each agent."""
     delayed: list[Observation]
+    """Those of earlier times."""
     repeated: list[Observation]
+    """Those that were left out, of all agents and times."""
 
 
 def drop_repeated(

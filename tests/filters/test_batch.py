@@ -218,7 +218,7 @@ def check_beliefs(
 
 
 def check_scores(
-    totals: dict[str, np.ndarray],
+    totals: np.ndarray,
     available: list[Any],
     times: np.ndarray,
     q: np.ndarray,
@@ -231,8 +231,7 @@ def check_scores(
     """
     for a, *run in np.ndindex(len(available), *runs):
         expected = score_jointly(available[a], times, q, tuple(run))
-        index = (*run, a)
-        result = [totals[name][index] for name in SCORES]
+        result = totals[(slice(None), *run, a)]
         assert np.allclose(result, expected, rtol=1e-9, atol=1e-8)
 
 
@@ -241,6 +240,39 @@ def make_walk(q: np.ndarray) -> LinearModel:
     return LinearModel.from_transition(
         2, model().transition_matrix, lambda t, dt: dt * (1 + t) * q
     )
+
+
+def make_graphs(times: np.ndarray, links: np.ndarray) -> dict[float, Graph]:
+    """Return the directed graph of each time."""
+    result = {}
+    for t, adjacency in zip(times, links, strict=True):
+        result[t] = Graph.from_adjacency(adjacency, directed=True)
+    return result
+
+
+def draw_prior(rng: Any, family: str) -> Any:
+    """Return the prior, for ensembles as members."""
+    if family != "ensemble":
+        return PRIOR
+    # Members with exactly these moments, which exact updates keep
+    draws = rng.standard_normal((120, 2))
+    return match_moments(draws, *PRIOR)
+
+
+def send_waiting(
+    waiting: list[list[Any]],
+    available: list[list[Any]],
+    owed: np.ndarray,
+    links: np.ndarray,
+    t: float,
+) -> None:
+    """Send to each receiver b, where links[b, a], all that waits at agent a, and charge it."""
+    for a, payload in enumerate(waiting):
+        if payload:
+            for b in np.flatnonzero(links[:, a]):
+                available[b] += payload
+                owed[a] += price(payload, t)
+            waiting[a] = []
 
 
 def list_arrivals(when: float, events: list[Any], agents: int) -> list[list[Any]]:
@@ -274,26 +306,20 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
     # Without process noise the other families are exact as well.
     q = Q if gaussian or family == "mixture" else 0 * Q
     walk = make_walk(q)
-    nets = {}
-    for t, adjacency in zip(times, links, strict=True):
-        nets[t] = Graph.from_adjacency(adjacency, directed=True)
+    nets = make_graphs(times, links)
     options: Any = {}
     if several:
         options = {"lag": lag, "share_observations": share, "record_evidence": True}
     f = FAMILIES[family](
         walk, team, nets.get, exchange_interval=every or None, **options
     )
-    prior: Any = PRIOR
-    if family == "ensemble":
-        # Members with exactly these moments, which exact updates keep
-        draws = rng.standard_normal((120, 2))
-        prior = match_moments(draws, *PRIOR)
+    prior = draw_prior(rng, family)
     events = draw_events(rng, team, times, runs, lag, several)
     # Written out here: which observations each agent has, and which wait for a contact.
     available = [[] for _ in team]
     waiting = [[] for _ in team]
     owed = np.zeros(agents)
-    totals = {name: np.zeros((*runs, agents)) for name in SCORES}
+    totals = np.zeros((len(SCORES), *runs, agents))
     state = f.start(prior, rng=rng, runs=runs, t=times[0])
     arrivals = [event[0] for event in events]
     for when in sorted({*range(1, steps + 1), *arrivals}):
@@ -310,17 +336,13 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
         for a, private in enumerate(now):
             available[a] += private
             waiting[a] += private
-            if may_send and waiting[a]:
-                for b in np.flatnonzero(links[k, :, a]):
-                    available[b] += waiting[a]
-                    owed[a] += price(waiting[a], t)
-                waiting[a] = []
+        if may_send:
+            send_waiting(waiting, available, owed, links[k], t)
         assert family == "news" or np.array_equal(state.ledger.scalars, owed)
         states = (state, *getattr(state, "lagged_states", ()))
         views = [(then.t, f.summarize(then)) for then in states]
         assert len(views) == 1 + min(lag * several, k)
         check_beliefs(views, available, times[: k + 1], q, runs)
         if several:
-            for name in SCORES:
-                totals[name] = totals[name] + getattr(state, name)
+            totals = totals + [getattr(state, name) for name in SCORES]
             check_scores(totals, available, times[: k + 1], q, runs)

@@ -6,6 +6,7 @@ Source: own.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -391,7 +392,7 @@ def test_a_density_as_a_function_is_the_sensor_with_its_noise(
 def test_a_gate_counts_the_numbers_that_are_there() -> None:
     """Of two numbers one is missing: χ² has one degree of freedom, also for mixtures."""
     still = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
-    team = [component([0, 1], std=1.0)]
+    team = [component([0, 1], std=1.0)] * 2
     # S = P + R = 2, and 6.63 is the 0.99 quantile of χ² with one degree.
     edge = np.sqrt(2 * 6.634896601021213)
     for make in (
@@ -399,11 +400,14 @@ def test_a_gate_counts_the_numbers_that_are_there() -> None:
         filters.GaussianSumFilter,
         partial(filters.MixtureFilter, target_dim=2),
     ):
-        f = make(still, team, gate_probability=0.99)
+        f = make(still, team, graphs.path(2), gate_probability=0.99)
+        if not isinstance(f, filters.MixtureFilter):
+            f = f.replace(share_observations=False)
         start = f.start(([0.0, 0.0], np.eye(2)))
         for factor, rejected in ((0.999, 0), (1.001, 1)):
-            state = f.step(start, 0.0, [[factor * edge, np.nan]])
-            assert np.asarray(state.rejected).sum() == rejected
+            # Of a second agent both numbers are there.
+            state = f.step(start, 0.0, [[factor * edge, np.nan], [0.1, -0.2]])
+            assert np.asarray(state.rejected).tolist() == [rejected, 0]
 
 
 def test_inflation_widens_the_present_and_its_correlation_with_the_past() -> None:
@@ -526,10 +530,30 @@ def test_a_compass_as_a_density_is_tested_the_shorter_way_round(make: Any) -> No
     for sensor in (plain, density):
         f = make(rest, [sensor], gate_probability=0.99, record_evidence=True)
         start = f.start(([3.1], [[0.04]]), rng=np.random.default_rng(0))
-        # Both ways round 3.1 is near -3.1 and far from 0.5.
-        runs.append(f.run(start, [1.0, 2.0, 3.0], [[[-3.1], [0.5], [3.0]]]))
+        # 3.1 is near -3.1 the shorter way, and opposite to 3.1 - π, beside which predictions are
+        # on both sides of the cut.
+        seen = [[-3.1], [3.1 - np.pi], [3.0]]
+        runs.append(f.run(start, [1.0, 2.0, 3.0], [seen]))
     a, b = runs
     assert a["rejected"].values.ravel().tolist() == [0.0, 1.0, 0.0]
     assert_equal(a, b, ("mean", "variance", "rejected", "n_observed"))
     # The variance of 20 members of equal weights is divided by 19 or by 20.
     assert np.allclose(a["nis"], b["nis"], rtol=1 / 19)
+
+
+@pytest.mark.parametrize("side", [-0.1, 0.1])
+def test_an_innovation_is_the_shorter_way_to_the_mean(side: float) -> None:
+    """Opposite to the mean, but for 0.1 rad: π - 0.1 on either side, and never π + 0.1."""
+    turn = (2 * np.pi,)
+    rest = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)), periods=turn)
+    compass = Sensor(1, lambda x: x, [[0.04]], periods=turn)
+    f = filters.ParticleFilter(rest, [compass], members=50, record_evidence=True)
+    # The first member, beside which the others are put, is on one side of the mean or the other.
+    members = 1.0 + np.sign(side) * np.linspace(0.3, -0.3, 50)[:, None]
+    start = f.start(members, rng=np.random.default_rng(0))
+    before = f.summarize(start)
+    y = before.mean[0, 0] + np.pi + side
+    with warnings.catch_warnings(action="ignore"):
+        state = f.step(start, 0.0, [[y]])
+    expected = (np.pi - 0.1) ** 2 / (before.variance[0, 0] + 0.04)
+    assert np.isclose(state.nis[0], expected, rtol=1e-9)

@@ -245,6 +245,35 @@ def test_an_event_that_arrives_later_is_refused_however_it_comes() -> None:
             call()
 
 
+@pytest.mark.parametrize("missing", [1.0, np.nan])
+def test_infinity_is_no_observation_however_it_comes(missing: float) -> None:
+    """Also beside another number that is there, or missing."""
+    f = GaussianFilter(constant_velocity(sigma=0.1), [component([0, 1], std=1.0)])
+    start = f.start(PRIOR)
+    value = [np.inf, missing]
+    calls = (
+        lambda: f.step(start, 1.0, [value]),
+        lambda: f.step(start, 1.0, [_events(value)]),
+        lambda: f.run(start, None, _events(value)),
+        lambda: f.run(start, [1.0], [[value]]),
+    )
+    for call in calls:
+        with pytest.raises(ValueError, match="must .*finite"):
+            call()
+
+
+def test_a_missing_event_needs_no_label() -> None:
+    """The other one is then the only one, of the agent's first sensor: one number is sent."""
+    team = [[component([0], std=1.0), component([1], std=1.0)], None]
+    f = GaussianFilter(constant_velocity(sigma=0.1), team, graphs.path(2))
+    start = f.start(PRIOR)
+    events = [Observation(1.0, 0, [0.3]), Observation(1.0, 0, [np.nan], 1)]
+    state = f.step(start, 1.0, [events, None])
+    assert state.ledger.scalars.tolist() == [1, 0]
+    run = f.run(start, None, events)
+    assert run["scalars"].values.tolist() == [[1, 0]]
+
+
 def test_a_missing_event_is_none() -> None:
     """An event of NaN alone changes nothing but the forecast."""
     f = GaussianFilter(constant_velocity(sigma=0.1), [component([0], std=1.0)])
