@@ -78,7 +78,9 @@ def upper_triangle(dim: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 def symmetrise(m: Array) -> Array:
     """Average matrices (..., d, d) and their transposes, which differ by rounding only."""
-    return np.asarray(0.5 * (m + m.swapaxes(-1, -2)))
+    total = m + m.mT
+    total *= 0.5
+    return np.asarray(total)
 
 
 @validated

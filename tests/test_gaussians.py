@@ -15,7 +15,7 @@ from distfilt.gaussians import (
     intersection,
     intersection_weights,
 )
-from distfilt.gaussians.single import log_density, unscented_points
+from distfilt.gaussians.single import joseph, log_density, unscented_points
 from tests.support import NAN, generator, relative_difference, spd, without_checks
 
 SEEDS = st.integers(0, 10_000)
@@ -525,3 +525,23 @@ def test_joseph_s_form_is_accurate_for_a_nearly_exact_observation() -> None:
     # P - K S Kᵀ would subtract numbers of 1e8 to leave 1e-8.
     _, p = condition(mean, 1e8 * cov, innovation, h, r)
     np.testing.assert_allclose(p[:M, :M], r, rtol=1e-6, atol=1e-13)
+
+
+@pytest.mark.parametrize("d", [5, 40])
+def test_joseph_s_form_is_its_product_with_any_gain(d: int) -> None:
+    """Small and large states, whose products are ordered differently; also far from the optimum."""
+    rng = np.random.default_rng(d)
+    root = rng.standard_normal((3, d, d)) * np.geomspace(1e-3, 1e3, d)[:, None]
+    cov = root @ root.mT
+    slope = rng.standard_normal((2, d))
+    noise = np.diag([0.5, 2.0])
+    innovation_cov = slope @ cov @ slope.T + noise
+    optimal = np.linalg.solve(innovation_cov, slope @ cov).mT
+    for gain in (optimal, 0.3 * optimal):
+        rest = np.eye(d) - gain @ slope
+        expected = rest @ cov @ rest.mT + gain @ noise @ gain.mT
+        found = joseph(cov, gain, slope, noise)
+        std = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+        scale = std[..., :, None] * std[..., None, :]
+        assert (np.abs(found - expected) / scale).max() < 1e-11
+        np.testing.assert_array_equal(found, found.mT)

@@ -130,12 +130,15 @@ class References:
         origin : (float, ndarray) or None
             The time and the members with which the step begins, if it has a length.
         """
-        rows = [self._times_of(agent) for agent in group.agents.tolist()]
+        agents = group.agents.tolist()
+        rows = [self._times_of(agent) for agent in agents]
         runs = np.broadcast_shapes(*[row.shape[:-1] for row in rows])
         m = group.target.shape[-1]
         cells = np.stack([np.broadcast_to(row, (*runs, m)) for row in rows], axis=-2)
         result = []
-        for time in sorted(_list_times([cells])):
+        sources = [source for agent in agents for source, _ in self.sources[agent]]
+        compared = [self.last[source] for source in sources if source is not None]
+        for time in sorted(_list_times(compared)):
             if time in times:
                 members = past[times.index(time)]
             elif origin is not None and time == origin[0]:
@@ -151,6 +154,16 @@ class References:
 
     def _times_of(self, agent: int) -> Array:
         """Return the times with which an agent's present numbers compare, NaN without one."""
+        numbers: list[float] = []
+        for source, size in self.sources[agent]:
+            time = np.nan if source is None else self.last[source]
+            if isinstance(time, np.ndarray):
+                return self._times_by_run(agent)
+            numbers += [time] * size
+        return np.array(numbers)
+
+    def _times_by_run(self, agent: int) -> Array:
+        """Return what `_times_of` does where components or runs have times of their own."""
         parts = []
         for source, size in self.sources[agent]:
             times = np.nan if source is None else self.last[source]

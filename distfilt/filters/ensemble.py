@@ -7,6 +7,7 @@ on its weights.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property, partial
@@ -350,7 +351,7 @@ class EnsembleFilter(
         weights_members = self._weights_members
         branch: Literal["mean", "each"] = "each" if weights_members else "mean"
         predicted = group.predict(members[place], previous, branch=branch)
-        if not np.isfinite(predicted).all():
+        if not math.isfinite(np.vdot(predicted, predicted)):
             is_unseen = np.asarray(np.isnan(predicted).any(axis=-2))
             step.note_unseen(group, is_unseen, "some members cannot see")
         group = step.gate(group, sample_moments, predicted, is_torn=weights_members)

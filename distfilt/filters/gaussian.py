@@ -421,9 +421,8 @@ class GaussianFamily(
         )
         if not is_part:
             return new_mean, new_cov
-        # Copies: the forecast's mean may be an array that the model keeps.
+        # The mean may be an array that the model keeps; the covariance is the step's own.
         means = means.copy()
-        covs = covs.copy()
         means[..., rows, :] = new_mean
         covs[..., rows, :, :] = new_cov
         return means, covs

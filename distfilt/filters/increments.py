@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
+from functools import lru_cache
 from itertools import product
+from typing import cast
 
 import numpy as np
 
 from ..linalg import cholesky, quadratic_form
 from ..mixtures import GaussianMixture
-from ..mixtures.conditioning import update_mixture
+from ..mixtures.conditioning import update_mixture, update_together
 from ..mixtures.fusion import align_mixture
 from ..periods import Periods
-from ..validation import Array, Bounds, NonNegativeInt, PositiveInt, validated
+from ..validation import (
+    Array,
+    Bounds,
+    Indices,
+    NonNegativeInt,
+    PositiveInt,
+    validated,
+)
+from .failures import RECOVERABLE
 from .mixture import MixtureState, TargetMixtureFilter
 from .observations import Observation, sensor_of
 from .step import Step
@@ -226,9 +237,7 @@ class InformationIncrementFilter(TargetMixtureFilter):
             # An increment below the threshold is sent with the next one.
             if increment.size:
                 # Without the zeros below the diagonal: 13 numbers for two rows of six.
-                n_rows, n_columns = increment.shape
-                upper = np.triu_indices(n_rows, m=n_columns)
-                outgoing[agent] = increment[upper]
+                outgoing[agent] = increment[_index_upper(*increment.shape)]
                 unsent[agent] = None
         return outgoing
 
@@ -240,17 +249,46 @@ class InformationIncrementFilter(TargetMixtureFilter):
         step: Step[MixtureState],
     ) -> None:
         """Send the increments, and assimilate those that are received, in place."""
-        for agent, messages in enumerate(step.channel.broadcast(outgoing)):
-            for payload in messages.values():
+        inbox = step.channel.broadcast(outgoing)
+        # Each agent assimilates the increments in the order of their senders.
+        for sender in range(len(after)):
+            receivers = [a for a, messages in enumerate(inbox) if sender in messages]
+            if receivers:
                 # z = H t + unit noise, as the sender's observations.
-                increment = _unpack(payload, self.target_dim)
-                before = unsent[agent]
-                periods = self.periods[: self.target_dim]
-                with step.failing_as(agent):
-                    after[agent] = _add_increment(after[agent], increment, periods)
-                    # A received increment counts for both, so that it is not sent on.
-                    if before is not None:
-                        unsent[agent] = _add_increment(before, increment, periods)
+                increment = _unpack(inbox[receivers[0]][sender], self.target_dim)
+                self._add_to_all(increment, receivers, after, unsent, step)
+
+    def _add_to_all(
+        self,
+        increment: Array,
+        receivers: list[int],
+        after: list[GaussianMixture],
+        unsent: list[GaussianMixture | None],
+        step: Step[MixtureState],
+    ) -> None:
+        """Assimilate an increment by its receivers, in place: by all in one call if possible."""
+        periods = self.periods[: self.target_dim]
+        if not any(period is not None for period in periods):
+            # An error comes again below, where it names its agent.
+            with suppress(*RECOVERABLE):
+                # A received increment counts for both, so that it is not sent on.
+                waiting = [a for a in receivers if unsent[a] is not None]
+                beliefs = [after[a] for a in receivers]
+                beliefs += [cast(GaussianMixture, unsent[a]) for a in waiting]
+                updated = update_together(beliefs, *_as_observation(increment))
+                for agent, belief in zip(receivers, updated, strict=False):
+                    after[agent] = belief
+                for agent, belief in zip(
+                    waiting, updated[len(receivers) :], strict=True
+                ):
+                    unsent[agent] = belief
+                return
+        for agent in receivers:
+            before = unsent[agent]
+            with step.failing_as(agent):
+                after[agent] = _add_increment(after[agent], increment, periods)
+                if before is not None:
+                    unsent[agent] = _add_increment(before, increment, periods)
 
     def _split_shared(
         self, observations: Sequence[Observation]
@@ -306,20 +344,34 @@ def _unpack(numbers: Array, n: int) -> Array:
     sizes = [r * (n + 1) - r * (r - 1) // 2 for r in range(1, n + 1)]
     n_rows = sizes.index(numbers.size) + 1
     increment = np.zeros((n_rows, n + 1))
-    increment[np.triu_indices(n_rows, m=n + 1)] = numbers
+    increment[_index_upper(n_rows, n + 1)] = numbers
     return increment
+
+
+@lru_cache(maxsize=16)
+def _index_upper(n_rows: int, n_columns: int) -> tuple[Indices, ...]:
+    """Return the index of a matrix's entries on and above the diagonal, made once."""
+    return np.triu_indices(n_rows, 0, n_columns)
 
 
 def _add_increment(
     belief: GaussianMixture, increment: Array, periods: Periods
 ) -> GaussianMixture:
     """Condition a belief on an increment's observations of its first components."""
+    values, predict, noise = _as_observation(increment)
+    if any(period is not None for period in periods):
+        values = _choose_branch(belief, increment[:, :-1], values, periods)
+    return update_mixture(belief, values, predict, noise)
+
+
+def _as_observation(
+    increment: Array,
+) -> tuple[Array, Callable[[Array], Array], Array]:
+    """Return an increment as values, the function that predicts them, and their noise."""
     rows = increment[:, :-1]
     values = increment[:, -1]
-    if any(period is not None for period in periods):
-        values = _choose_branch(belief, rows, values, periods)
 
     def predict(x: Array) -> Array:
         return x[..., : rows.shape[1]] @ rows.T
 
-    return update_mixture(belief, values, predict, np.eye(values.size))
+    return values, predict, np.eye(values.size)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from typing import Annotated, ClassVar, cast
@@ -11,7 +12,12 @@ import numpy as np
 
 from ..linalg import deviations
 from ..mixtures import GaussianMixture, runnalls
-from ..mixtures.conditioning import propagate_mixture, update_mixture, within_gate
+from ..mixtures.conditioning import (
+    propagate_mixture,
+    propagate_together,
+    update_mixture,
+    within_gate,
+)
 from ..mixtures.fusion import align_mixture
 from ..mixtures.splitting import split_nonlinear
 from ..network import Channel
@@ -32,6 +38,7 @@ from ..validation import (
     call_user,
 )
 from .base import SensorFilter
+from .failures import RECOVERABLE
 from .observations import Observation, sensor_of
 from .options import ExchangesAtIntervals, FusesBeliefs
 from .priors import Prior, prior_mixtures
@@ -117,10 +124,7 @@ class TargetMixtureFilter(
 
     def next_state(self, step: Step[MixtureState]) -> MixtureState:
         """Split and forecast, condition on the agent's observations, exchange, reduce."""
-        beliefs = [
-            self._forecast(belief, agent, step)
-            for agent, belief in enumerate(step.state.mixtures)
-        ]
+        beliefs = self._forecast_all(step.state.mixtures, step)
         # Conditioning and exchange are the family's.
         after, unsent = self._assimilate(beliefs, step)
         return step.end(
@@ -156,6 +160,28 @@ class TargetMixtureFilter(
         """Return the beliefs after observations and exchange, and the `unsent` of the state."""
         raise NotImplementedError
 
+    def _forecast_all(
+        self, beliefs: Sequence[GaussianMixture], step: Step[MixtureState]
+    ) -> list[GaussianMixture]:
+        """Forecast all agents' beliefs: in one call, unless components are split."""
+        if self.split_threshold is None and step.dt:
+            # An error comes again below, where it names its agent.
+            with suppress(*RECOVERABLE):
+                return propagate_together(beliefs, *self._motion(step))
+        return [
+            self._forecast(belief, agent, step) for agent, belief in enumerate(beliefs)
+        ]
+
+    def _motion(
+        self, step: Step[MixtureState]
+    ) -> tuple[Callable[[Array], Array], Array]:
+        """Return the function that moves points in a step, and the factor of its noise."""
+        t = step.state.t
+        noise_sqrt = self.model.noise_sqrt(t, step.dt)
+        if self.periods or self.notices_wrapping:
+            return partial(self._step_points, step), noise_sqrt
+        return partial(self.model.step, t=t, dt=step.dt), noise_sqrt
+
     def _forecast(
         self, belief: GaussianMixture, agent: int, step: Step[MixtureState]
     ) -> GaussianMixture:
@@ -184,12 +210,7 @@ class TargetMixtureFilter(
                     split_threshold=self.split_threshold,
                     scale=self.split_scale,
                 )
-            noise_sqrt = model.noise_sqrt(t, dt)
-            if self.periods or self.notices_wrapping:
-                move = partial(self._step_points, step)
-            else:
-                move = partial(model.step, t=t, dt=dt)
-            return propagate_mixture(belief, move, noise_sqrt)
+            return propagate_mixture(belief, *self._motion(step))
 
     def _step_points(self, step: Step[MixtureState], points: Array) -> Array:
         """Move the components' points (L, N, d) without noise, each component's on one branch."""

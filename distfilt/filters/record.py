@@ -204,7 +204,7 @@ def record_run(
     # The truth is checked before the first step.
     known_truth = _read_truth(recording, names, (times.size, *runs), len(agents), times)
     keep = _read_keep(recording.keep, f, start, known_truth)
-    collected = _collect_series(f, start, believed, known_truth, keep)
+    collected = _collect_series(f, times.size, start, believed, known_truth, keep)
     series = collected.series
 
     # Axes: time first, then the runs, then the agents.
@@ -249,6 +249,7 @@ class _Collected(NamedTuple):
 
 def _collect_series(
     f: Filter[AnyState],
+    n_times: int,
     start: AnyState,
     believed: Iterable[Believed[AnyState]],
     known: _KnownTruth | None,
@@ -258,7 +259,7 @@ def _collect_series(
 
     Only variables to `keep` are collected, and the variance, which the spread needs.
     """
-    rows: list[dict[str, Array]] = []
+    series: dict[str, Array] = {}
     counts = [_read_ledgers([start.ledger])]
     first = 0
     last = start
@@ -284,14 +285,15 @@ def _collect_series(
             row |= _score_block(f, summary, known, index)
         if keep is not None:
             row = {name: row[name] for name in row if name in (*keep, "variance")}
-        if is_single:
-            row = {name: value[None] for name, value in row.items()}
-        rows.append(row)
+        times = slice(first, first + len(block))
+        for name, value in row.items():
+            _write_block(
+                series, name, value[None] if is_single else value, times, n_times
+            )
         first += len(block)
     totals = {name: np.concatenate([c[name] for c in counts]) for name in counts[0]}
-    if not rows:
+    if not series:
         return _Collected(_read_nothing(f, start, known), totals, last)
-    series = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
     # Filters that have periods, or lack them, have a model of motion.
     if known is not None and getattr(f, "lacks_periods", False):
         model = cast("SensorFilter[State]", f).model
@@ -302,6 +304,22 @@ def _collect_series(
     is_missing = np.isnan(variance).all(axis=-1)
     series["spread"] = np.where(is_missing, np.nan, spread)
     return _Collected(series, totals, last)
+
+
+def _write_block(
+    series: dict[str, Array], name: str, values: Array, times: slice, n_times: int
+) -> None:
+    """Write the values of some times, (block, ...), into the array of all times, (T, ...).
+
+    Made when the first block is known, each array is filled in place: a long record is not copied.
+    """
+    if name not in series:
+        series[name] = np.empty((n_times, *values.shape[1:]), values.dtype)
+    elif values.dtype != series[name].dtype:
+        # Whole numbers so far, and fractions from now on
+        common = np.result_type(values, series[name])
+        series[name] = series[name].astype(common)
+    series[name][times] = values
 
 
 def _read_ledgers(ledgers: list[Ledger]) -> dict[str, Array]:

@@ -114,8 +114,7 @@ def intersect_gaussians(
 
     # [Σ ω_b G_bᵀ G_b, Σ ω_b G_bᵀ z_b] in one product over sources and components.
     stacked = scaled.reshape(*scaled.shape[:-3], -1, d + 1)
-    transposed = np.ascontiguousarray(stacked[..., :d].swapaxes(-1, -2))
-    total = transposed @ stacked
+    total = stacked[..., :d].mT @ stacked
     total[..., :d] += first_weight * np.eye(d)  # G₁ = I
     unit_weights = np.ones(scaled.shape[:-2])
     information_root = _factor_sum(
@@ -125,8 +124,7 @@ def intersect_gaussians(
     # P = R Rᵀ with R = L₁ C⁻ᵀ for the sum C Cᵀ, and m = m₁ + R C⁻¹ Σ ω_b G_bᵀ z_b.
     right = _join_columns(first_lower.swapaxes(-1, -2), total[..., d:])
     solution = solve_lower(information_root, right)
-    root = np.ascontiguousarray(solution[..., :d].swapaxes(-1, -2))
-    fused = root @ solution
+    fused = solution[..., :d].mT @ solution
     return first_mean + fused[..., d], symmetrise(fused[..., :d])
 
 

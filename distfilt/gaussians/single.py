@@ -15,6 +15,7 @@ from ..linalg import (
     log_det,
     quadratic_form,
     solve_definite,
+    symmetrise,
 )
 from ..validation import (
     ALLOW_NAN,
@@ -28,6 +29,10 @@ from ..validation import (
 )
 
 __all__ = ["condition", "log_density", "unscented_points"]
+
+# From this size of the state on, few numbers are observed of it in one update, such as of a joint
+# state of many bodies or of earlier times, and two products of whole matrices take long.
+_LARGE = 24
 
 
 @validated
@@ -155,13 +160,18 @@ def innovation_moments(
 def joseph(cov: Array, gain: Array, H: Array, R: Array) -> Array:
     """The covariance (..., d, d) after an update with any gain K (..., d, m), in Joseph's form.
 
-    As a sum of squares it cannot become indefinite by rounding.
+    Errors of the gain enter in second order only. As a sum of squares a small covariance cannot
+    become indefinite by rounding.
     """
     # P⁺ = (I - K H) P (I - K H)ᵀ + K R Kᵀ
+    if cov.shape[-1] >= _LARGE:
+        # With A = (I - K H) P it is A - (A Hᵀ - K R) Kᵀ: no product of two matrices (d, d).
+        left = cov - gain @ (H @ cov)
+        return symmetrise(left - (left @ H.mT - gain @ R) @ gain.mT)
     reduction = identity(cov.shape[-1]) - gain @ H
     prior_part = reduction @ cov @ np.ascontiguousarray(reduction.mT)
     posterior = prior_part + gain @ R @ gain.mT
-    return np.asarray(0.5 * (posterior + posterior.mT))
+    return symmetrise(posterior)
 
 
 @validated

@@ -7,7 +7,7 @@ Filters call these functions, with models and sensors that have been checked.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from ..gaussians.single import unscented_points
 from ..linalg import cholesky, log_det, lower_root, quadratic_form
 from ..validation import Array, call_user
-from .gaussian import GaussianMixture
+from .gaussian import GaussianMixture, divide_among, factor_together
 
 __all__ = ["propagate_mixture", "update_mixture", "within_gate"]
 
@@ -58,6 +58,32 @@ def propagate_mixture(
     return _build_from_factors(mixture.weights, differences.mean, factors)
 
 
+def propagate_together(
+    mixtures: Sequence[GaussianMixture],
+    function: Callable[[Array], Array],
+    noise_factor: Array,
+) -> list[GaussianMixture]:
+    """Propagate several mixtures of one dimension as :func:`propagate_mixture`, in one call.
+
+    >>> two = [GaussianMixture.gaussian([m], [[0.25]]) for m in (1.0, 2.0)]
+    >>> after = propagate_together(two, lambda x: 2 * x, np.zeros((1, 1)))
+    >>> [mixture.means.ravel() for mixture in after]
+    [array([2.]), array([4.])]
+    """
+    # Each component moves by itself, so that those of all mixtures may be taken for one.
+    after = propagate_mixture(_join(mixtures), function, noise_factor)
+    parts = [
+        divide_among(values, mixtures)
+        for values in (after.means, after.covs, after.factors)
+    ]
+    result = []
+    for mixture, means, covs, factors in zip(mixtures, *parts, strict=True):
+        result.append(
+            GaussianMixture.construct(mixture.weights, means, covs, factors=factors)
+        )
+    return result
+
+
 def update_mixture(
     mixture: GaussianMixture,
     observed: Array,
@@ -98,8 +124,32 @@ def update_mixture(
     >>> after.means.ravel().round(6), after.weights.round(3)
     (array([-0.5,  1.5]), array([0.119, 0.881]))
     """
+    (updated,) = update_together(
+        [mixture], observed, function, noise, residual=residual, on_branch=on_branch
+    )
+    return updated
+
+
+def update_together(
+    mixtures: Sequence[GaussianMixture],
+    observed: Array,
+    function: Callable[[Array], Array],
+    noise: Array,
+    *,
+    residual: Callable[[Array, Array], Array] = np.subtract,
+    on_branch: bool = False,
+) -> list[GaussianMixture]:
+    """Condition several mixtures of one dimension on one observation as :func:`update_mixture`.
+
+    >>> two = [GaussianMixture.gaussian([m], [[1.0]]) for m in (0.0, 2.0)]
+    >>> after = update_together(two, np.ones(1), lambda x: x, np.eye(1))
+    >>> [mixture.means.ravel().round(6) for mixture in after]
+    [array([0.5]), array([1.5])]
+    """
     if np.isnan(observed).all():
-        return mixture
+        return list(mixtures)
+    # Each component is updated by itself, so that those of all mixtures may be taken for one.
+    mixture = _join(mixtures)
     innovation = _find_innovations(
         mixture, observed, function, noise, residual, on_branch
     )
@@ -110,14 +160,37 @@ def update_mixture(
     # K = P_xy S⁻¹ by two triangular solves, with P_xy = L firstᵀ.
     cross = mixture.factors @ first.mT
     gain = np.linalg.solve(root.mT, np.linalg.solve(root, cross.mT)).mT
-    means = mixture.means + (gain @ innovation.values[..., None])[..., 0]
     # P⁺ = (L - K first)(…)ᵀ + (K second)(…)ᵀ + (K noise)(…)ᵀ, a sum of squares.
     factors = _combine_roots(
         mixture.factors - gain @ first, gain @ second, gain @ noise_factor
     )
-    # Weights by the likelihood N(innovation; 0, S).
-    squared_lengths = quadratic_form(root, innovation.values)
-    logs = -0.5 * (squared_lengths + log_det(root) + len(noise_factor) * _LOG_2PI)
+    parts = [
+        divide_among(values, mixtures)
+        for values in (innovation.values, root, gain, factors)
+    ]
+    updated = []
+    for one, *of_mixture in zip(mixtures, *parts, strict=True):
+        updated.append(_update_means_and_weights(one, *of_mixture))
+    return updated
+
+
+def _update_means_and_weights(
+    mixture: GaussianMixture,
+    innovations: Array,
+    root: Array,
+    gain: Array,
+    factors: Array,
+) -> GaussianMixture:
+    """Return the mixture of updated components, with weights by N(innovation; 0, S).
+
+    `root` (L, k, k) is a triangular root of S, and `gain` (L, d, k).
+    """
+    # In memory as those of one mixture alone, so that the sum is rounded alike.
+    innovations = innovations.copy("K")
+    means = mixture.means + (gain @ innovations[..., None])[..., 0]
+    squared_lengths = quadratic_form(root, innovations)
+    size = innovations.shape[-1]
+    logs = -0.5 * (squared_lengths + log_det(root) + size * _LOG_2PI)
     logs = np.where(np.isfinite(logs), mixture.log_weights + logs, -np.inf)
     if not np.isfinite(logs.max()):
         raise ValueError(
@@ -218,6 +291,19 @@ def _find_innovations(
         spread.first,
         spread.second,
         noise_factor=cholesky(noise[np.ix_(present, present)]),
+    )
+
+
+def _join(mixtures: Sequence[GaussianMixture]) -> GaussianMixture:
+    """Return the components of several mixtures as those of one, whose weights do not matter."""
+    if len(mixtures) == 1:
+        return mixtures[0]
+    factor_together(mixtures)
+    return GaussianMixture.construct(
+        np.concatenate([mixture.weights for mixture in mixtures]),
+        np.concatenate([mixture.means for mixture in mixtures]),
+        np.concatenate([mixture.covs for mixture in mixtures]),
+        factors=np.concatenate([mixture.factors for mixture in mixtures]),
     )
 
 

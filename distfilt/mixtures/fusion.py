@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Literal
 
 import numpy as np
@@ -11,8 +12,21 @@ from ..linalg import log_sum_exp
 from ..network import Channel, fusion_rule
 from ..periods import Periods, align
 from ..validation import Array, PositiveInt, UnitInterval, call_user, validated
-from .gaussian import GaussianMixture, assemble_joint, regression
-from .partial_fusion import Exponents, Others, PartialFusion, Rule, Terms
+from .gaussian import (
+    GaussianMixture,
+    assemble_joint,
+    factor_together,
+    invert_together,
+    regression,
+)
+from .partial_fusion import (
+    Exponents,
+    Others,
+    PartialFusion,
+    Rule,
+    Terms,
+    fuse_by_receiver,
+)
 from .reduction import runnalls
 
 __all__ = [
@@ -235,18 +249,74 @@ def target_fusion(
     """
     indices = range(target_dim)
     periods = channel.periods[:target_dim]
-    messages = [belief.marginal(indices).pack() for belief in beliefs]
+    targets = [belief.marginal(indices) for belief in beliefs]
+    messages = [target.pack() for target in targets]
+    received = _unpack_messages(channel.broadcast(messages))
+    for agent, of_agent in enumerate(received):
+        # Angles on the branch of the receiver's.
+        mean = beliefs[agent].mean[:target_dim]
+        received[agent] = [align_mixture(m, mean, periods) for m in of_agent]
+    if fuse is fuse_mixtures:
+        with suppress(np.linalg.LinAlgError):
+            fused = _fuse_together(beliefs, targets, received)
+            factor_together(fused)
+            return tuple(fused)
+    # Agent by agent, so that an error names the agent.
     fused = list(beliefs)
-    for agent, payloads in enumerate(channel.broadcast(messages)):
+    for agent, of_agent in enumerate(received):
         try:
-            if payloads:
-                received = [GaussianMixture.unpack(p) for p in payloads.values()]
-                # Angles on the branch of the receiver's.
-                mean = fused[agent].mean[:target_dim]
-                received = [align_mixture(m, mean, periods) for m in received]
-                fused[agent] = call_user(fuse, fused[agent], received)
+            if of_agent:
+                fused[agent] = call_user(fuse, fused[agent], of_agent)
             # The factors are computed here, so that an error names this agent.
             fused[agent].factors  # noqa: B018
         except np.linalg.LinAlgError as error:
             raise np.linalg.LinAlgError(f"agent {agent}: {error}") from error
     return tuple(fused)
+
+
+def _unpack_messages(
+    inbox: Sequence[dict[int, tuple[Array, Array, Array]]],
+) -> list[list[GaussianMixture]]:
+    """Return the mixtures that each agent has received, in the order of the senders.
+
+    A message that arrives unchanged at several agents is one mixture, of which all use the caches.
+    """
+    # The payloads live as long as the inbox, so that their ids belong to one each.
+    unpacked: dict[int, GaussianMixture] = {}
+    received = []
+    for payloads in inbox:
+        for payload in payloads.values():
+            if id(payload) not in unpacked:
+                unpacked[id(payload)] = GaussianMixture.unpack(payload)
+        received.append([unpacked[id(payload)] for payload in payloads.values()])
+    return received
+
+
+def _fuse_together(
+    beliefs: Sequence[GaussianMixture],
+    targets: Sequence[GaussianMixture],
+    received: Sequence[list[GaussianMixture]],
+) -> list[GaussianMixture]:
+    """Fuse each belief with those received as `fuse_mixtures` does, many in one call.
+
+    The targets are the beliefs' marginals.
+    """
+    # Each message once
+    messages = {id(m): m for of_agent in received for m in of_agent}
+    invert_together(list(messages.values()))
+    # Receivers whose dimension, and whose messages, have the same sizes
+    alike: dict[tuple[int, ...], list[int]] = {}
+    for agent, of_agent in enumerate(received):
+        sizes = tuple([m.n_components for m in of_agent])
+        if sizes:
+            alike.setdefault((beliefs[agent].dim, *sizes), []).append(agent)
+    fused = list(beliefs)
+    for agents in alike.values():
+        results = fuse_by_receiver(
+            [beliefs[agent] for agent in agents],
+            [targets[agent] for agent in agents],
+            [received[agent] for agent in agents],
+        )
+        for agent, new in zip(agents, results, strict=True):
+            fused[agent] = new
+    return fused

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, NamedTuple, Self, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..linalg import (
     log_det,
@@ -33,6 +33,7 @@ from ..validation import (
 __all__ = ["GaussianMixture"]
 
 _LOG_2PI = float(np.log(2 * np.pi))
+E = TypeVar("E", bound=np.generic)
 # Numbers in one block of an evaluation: half a megabyte stays in the cache.
 _BLOCK_SIZE = 60_000
 
@@ -154,6 +155,11 @@ class GaussianMixture(FrozenModel):
             return np.asarray(np.linalg.cholesky(self.covs))
         except np.linalg.LinAlgError:
             raise np.linalg.LinAlgError(_describe_collapse(self.covs)) from None
+
+    @cached_property
+    def precisions(self) -> Array:
+        """Inverses of the covariances, (L, d, d)."""
+        return inverse(self.factors)
 
     @cached_property
     def log_peaks(self) -> Array:
@@ -330,6 +336,68 @@ def _describe_collapse(covs: Array) -> str:
         "collapses where information is counted more than once, as by fusing beliefs as if they "
         "were independent"
     )
+
+
+def factor_together(mixtures: Sequence[GaussianMixture]) -> None:
+    """Compute the factors of several mixtures, which they keep in their caches.
+
+    One call for all of one dimension takes a fraction of the time of a call for each.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If some covariance is not positive definite.
+
+    Examples
+    --------
+    >>> two = [GaussianMixture.gaussian([0.0], [[p]]) for p in (4.0, 9.0)]
+    >>> factor_together(two)
+    >>> [float(mixture.factors[0, 0, 0]) for mixture in two]
+    [2.0, 3.0]
+    """
+    new_by_dim: dict[int, list[GaussianMixture]] = {}
+    for mixture in mixtures:
+        if "factors" not in vars(mixture):
+            new_by_dim.setdefault(mixture.dim, []).append(mixture)
+    for new in new_by_dim.values():
+        factors = np.linalg.cholesky(np.concatenate([mixture.covs for mixture in new]))
+        for mixture, part in zip(new, divide_among(factors, new), strict=True):
+            vars(mixture)["factors"] = part
+
+
+def invert_together(mixtures: Sequence[GaussianMixture]) -> None:
+    """Compute the precisions of several mixtures of one dimension, as :func:`factor_together`.
+
+    >>> two = [GaussianMixture.gaussian([0.0], [[p]]) for p in (4.0, 0.25)]
+    >>> invert_together(two)
+    >>> [float(mixture.precisions[0, 0, 0]) for mixture in two]
+    [0.25, 4.0]
+    """
+    factor_together(mixtures)
+    new = [mixture for mixture in mixtures if "precisions" not in vars(mixture)]
+    if not new:
+        return
+    precisions = inverse(np.concatenate([mixture.factors for mixture in new]))
+    for mixture, part in zip(new, divide_among(precisions, new), strict=True):
+        vars(mixture)["precisions"] = part
+
+
+def divide_among(
+    values: NDArray[E], mixtures: Sequence[GaussianMixture]
+) -> list[NDArray[E]]:
+    """Return the parts of values (ΣL, ...) that belong to each mixture's components, in order.
+
+    >>> two = [GaussianMixture.gaussian([m], [[1.0]]) for m in (0.0, 3.0)]
+    >>> divide_among(np.array([5.0, 7.0]), two)
+    [array([5.]), array([7.])]
+    """
+    parts = []
+    start = 0
+    for mixture in mixtures:
+        stop = start + len(mixture.weights)
+        parts.append(values[start:stop])
+        start = stop
+    return parts
 
 
 def inverse(factors: Array) -> Array:

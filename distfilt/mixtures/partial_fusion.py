@@ -34,7 +34,13 @@ from ..validation import (
     check_probabilities,
     validated,
 )
-from .gaussian import GaussianMixture, assemble_joint, inverse, regression
+from .gaussian import (
+    GaussianMixture,
+    assemble_joint,
+    divide_among,
+    invert_together,
+    regression,
+)
 from .reduction import ComponentShapes
 
 __all__ = ["PartialFusion", "nonnegative_least_squares", "tikhonov"]
@@ -344,7 +350,7 @@ def _multiply_received(
     vectors = np.zeros((n_centres, 1, n))
     for exponent, other in zip(exponents, received, strict=True):
         # Each component of this belief is added to every choice so far.
-        precisions = exponent * inverse(other.factors)
+        precisions = exponent * other.precisions
         differences = other.means - centres[:, None]
         added = np.einsum("rij,srj->sri", precisions, differences)
         information = information[:, :, None] + precisions
@@ -368,6 +374,26 @@ def _fuse_components(
     regression. `pairs` are the indices q and p, (Q,) each; with T products the result has up to
     Q T components, those whose covariance is positive definite.
     """
+    q, p = pairs
+    information, vectors = _update_information(
+        prior, divided, received, exponents, pairs
+    )
+    is_matched = (q == p) & (len(divided.means) == prior.n_components)
+    smallest_pivot = np.where(is_matched, _MATCHED_PIVOT, _UNMATCHED_PIVOT)
+    means, covs, is_definite = _update_components(
+        prior, q, information, vectors, smallest_pivot
+    )
+    return _select_definite(means, covs, q, is_definite)
+
+
+def _update_information(
+    prior: GaussianMixture,
+    divided: GaussianMixture,
+    received: Sequence[GaussianMixture],
+    exponents: Array,
+    pairs: tuple[Indices, Indices],
+) -> tuple[Array, Array]:
+    """Return the information Λ (Q, T, n, n) and vectors η (Q, T, n) by which components change."""
     n = divided.dim
     q, p = pairs
     # Vectors are relative to the prior component's mean: far from the origin they would cancel.
@@ -375,16 +401,28 @@ def _fuse_components(
     information, vectors = _multiply_received(received, exponents[1:], centres)
     if exponents[0] != 1:
         # The division: Λ += (ω - 1) P_p⁻¹ and η += (ω - 1) P_p⁻¹ (m_p - c).
-        precisions = (exponents[0] - 1) * inverse(divided.factors)[p]
+        precisions = (exponents[0] - 1) * divided.precisions[p]
         differences = divided.means[p] - centres
         information = information + precisions[:, None]
         vectors = vectors + (precisions @ differences[..., None])[:, None, :, 0]
+    return information, vectors
 
+
+def _update_components(
+    prior: GaussianMixture,
+    q: Indices,
+    information: Array,
+    vectors: Array,
+    smallest_pivot: Array,
+) -> tuple[Array, Array, Mask]:
+    """Return means (Q, T, d) and covariances of the updated components q, and which are definite.
+
+    The pivots (Q,) are those of `_factor_definite`.
+    """
+    n = vectors.shape[-1]
     # P_tt = S (I + Sᵀ Λ S)⁻¹ Sᵀ with the prior's own P_tt = S Sᵀ.
     root = np.linalg.cholesky(prior.covs[q, :n, :n])[:, None]
     relative = np.eye(n) + root.mT @ symmetrise(information) @ root
-    is_matched = (q == p) & (len(divided.means) == prior.n_components)
-    smallest_pivot = np.where(is_matched, _MATCHED_PIVOT, _UNMATCHED_PIVOT)
     lower, is_definite = _factor_definite(relative, smallest_pivot[:, None])
     # I + Sᵀ Λ S = C Cᵀ, so that P_tt = (C⁻¹ Sᵀ)ᵀ (C⁻¹ Sᵀ).
     half = np.linalg.solve(lower, np.broadcast_to(root.mT, lower.shape))
@@ -397,6 +435,13 @@ def _fuse_components(
     shift = np.concatenate([target_shift, ego_shift], axis=-1)
     means = prior.means[q, None] + shift
     covs = assemble_joint(target, gain[q, None], conditional[q, None])
+    return means, covs, is_definite
+
+
+def _select_definite(
+    means: Array, covs: Array, q: Indices, is_definite: Mask
+) -> ComponentShapes:
+    """Return the shapes of the components that have a positive definite covariance."""
     source = np.broadcast_to(q[:, None], is_definite.shape)
     return ComponentShapes.construct(
         means[is_definite],
@@ -404,6 +449,69 @@ def _fuse_components(
         source[is_definite],
         int((~is_definite).sum()),
     )
+
+
+def fuse_by_receiver(
+    priors: Sequence[GaussianMixture],
+    targets: Sequence[GaussianMixture],
+    received: Sequence[Sequence[GaussianMixture]],
+) -> list[GaussianMixture]:
+    """Fuse several receivers' beliefs with those that each has received, all exponents equal.
+
+    The results are those of :func:`~distfilt.mixtures.fuse_mixtures`. The targets are the priors'
+    marginals. The receivers' states have one dimension, and their messages one number of components
+    each in order, so that one call updates the components of all.
+
+    >>> pair = [GaussianMixture.gaussian([m], [[1.0]]) for m in (0.0, 3.0)]
+    >>> after = fuse_by_receiver(pair, pair, [pair[1:], pair[:1]])
+    >>> [fused.means.ravel() for fused in after]
+    [array([1.5]), array([1.5])]
+    """
+    fusions = [
+        PartialFusion.construct(prior, tuple(others), target=target)
+        for prior, target, others in zip(priors, targets, received, strict=True)
+    ]
+    invert_together(targets)
+    changes = []
+    for fusion in fusions:
+        index = np.arange(fusion.prior.n_components)
+        changes.append(
+            _update_information(
+                fusion.prior,
+                fusion.target,
+                fusion.others,
+                fusion.exponents,
+                (index, index),
+            )
+        )
+    # All receivers' components as those of one mixture
+    everyone = GaussianMixture.construct(
+        np.concatenate([prior.weights for prior in priors]),
+        np.concatenate([prior.means for prior in priors]),
+        np.concatenate([prior.covs for prior in priors]),
+    )
+    n_all = everyone.n_components
+    means, covs, is_definite = _update_components(
+        everyone,
+        np.arange(n_all),
+        np.concatenate([information for information, _ in changes]),
+        np.concatenate([vectors for _, vectors in changes]),
+        np.full(n_all, _MATCHED_PIVOT),
+    )
+    of_receivers = zip(
+        divide_among(means, priors),
+        divide_among(covs, priors),
+        divide_among(is_definite, priors),
+        strict=True,
+    )
+    fused = []
+    for fusion, (own_means, own_covs, own_definite) in zip(
+        fusions, of_receivers, strict=True
+    ):
+        index = np.arange(fusion.prior.n_components)
+        shapes = _select_definite(own_means, own_covs, index, own_definite)
+        fused.append(fusion.assign_weights(shapes))
+    return fused
 
 
 def _factor_definite(matrices: Array, smallest_pivot: Array) -> tuple[Array, Mask]:

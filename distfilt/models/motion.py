@@ -252,7 +252,11 @@ def _lorenz_rate(state: Array, t: float) -> Array:
     z = state[..., 2]
     rate = np.empty_like(state)
     # Written into the rate without temporary arrays: this is the inner loop of every study.
-    np.multiply(_PRANDTL, y - x, rate[..., 0])
-    np.subtract(x * (_RAYLEIGH - z), y, rate[..., 1])
-    np.subtract(x * y, _SHAPE * z, rate[..., 2])
+    x_rate = np.subtract(y, x, rate[..., 0])
+    x_rate *= _PRANDTL
+    y_rate = np.subtract(_RAYLEIGH, z, rate[..., 1])
+    y_rate *= x
+    y_rate -= y
+    z_rate = np.multiply(x, y, rate[..., 2])
+    z_rate -= _SHAPE * z
     return rate

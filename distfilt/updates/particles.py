@@ -346,7 +346,6 @@ def log_likelihood(
         residual = np.where(missing[..., None], 0.0, residual)
     # -|L⁻¹ r|² / 2 with R = L Lᵀ: one solve with all particles as right-hand sides.
     whitened = solve_lower(cholesky(covariance), residual)
-    whitened = np.ascontiguousarray(whitened)
     logs = np.asarray(-0.5 * (whitened * whitened).sum(axis=-2))
     if contradicting is not None:
         logs[contradicting] = -np.inf

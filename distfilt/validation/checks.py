@@ -209,7 +209,8 @@ def refuse_mask(value: object, name: str) -> None:
     Traceback (most recent call last):
     distfilt.validation.InvalidArgumentError: h must return numbers, got MaskedArray: ...
     """
-    if isinstance(value, np.ma.MaskedArray):
+    # A plain array, the usual case, has no mask.
+    if type(value) is not np.ndarray and isinstance(value, np.ma.MaskedArray):
         raise InvalidArgumentError(
             f"{name} must return numbers, got {type_name(value)}{describe_conversion(value)}"
         )

@@ -16,7 +16,9 @@ from distfilt.mixtures import (
 )
 from distfilt.mixtures.conditioning import (
     propagate_mixture,
+    propagate_together,
     update_mixture,
+    update_together,
     within_gate,
 )
 from distfilt.mixtures.splitting import split_nonlinear
@@ -265,3 +267,26 @@ def test_the_most_stretched_are_split_while_there_is_room() -> None:
     # No room for two more components, or no stretching above the threshold.
     assert split_nonlinear(two, slope, max_components=3, split_threshold=0.6) is two
     assert split_nonlinear(two, slope, max_components=50, split_threshold=2.5) is two
+
+
+def test_mixtures_together_are_each_alone() -> None:
+    """Bit by bit, for mixtures of several sizes."""
+    mixtures = [random_mixture(n, 3, seed) for seed, n in enumerate((1, 3, 1, 2))]
+    observed = np.array([0.3, -0.2])
+
+    def bend(x: np.ndarray) -> np.ndarray:
+        return np.sin(x) + 0.1 * x * x
+
+    def look(x: np.ndarray) -> np.ndarray:
+        return bend(x) @ H.T
+
+    moved = propagate_together(mixtures, bend, P.factors[0])
+    updated = update_together(mixtures, observed, look, R)
+    for mixture, one, other in zip(mixtures, moved, updated, strict=True):
+        for result, alone in (
+            (one, propagate_mixture(mixture, bend, P.factors[0])),
+            (other, update_mixture(mixture, observed, look, R)),
+        ):
+            np.testing.assert_array_equal(result.weights, alone.weights)
+            np.testing.assert_array_equal(result.means, alone.means)
+            np.testing.assert_array_equal(result.covs, alone.covs)

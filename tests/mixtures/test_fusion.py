@@ -442,3 +442,21 @@ def test_a_collapse_names_the_agent_the_component_and_the_cause() -> None:
         np.linalg.LinAlgError, match="^agent 0: component 1 of 2 .*independent"
     ):
         target_fusion(BELIEFS, Channel(graphs.path(3)), target_dim=2, fuse=naive)
+
+
+def test_agents_that_are_fused_together_are_each_fused_alone() -> None:
+    """Bit by bit, for states and messages of several sizes, and an agent that receives nothing."""
+    links = [(1, 0), (2, 0), (0, 1), (2, 1), (1, 2), (4, 3)]
+    graph = Graph.from_edges(6, links, directed=True)
+    sizes = [(1, 4), (1, 4), (3, 4), (2, 3), (2, 3), (1, 5)]
+    beliefs = [random_mixture(n, dim, k) for k, (n, dim) in enumerate(sizes)]
+
+    def fuse_alone(prior: GaussianMixture, others: object) -> GaussianMixture:
+        return fuse_mixtures(prior, others)
+
+    together = target_fusion(beliefs, Channel(graph), target_dim=2)
+    alone = target_fusion(beliefs, Channel(graph), target_dim=2, fuse=fuse_alone)
+    for one, other in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(one.weights, other.weights)
+        np.testing.assert_array_equal(one.means, other.means)
+        np.testing.assert_array_equal(one.covs, other.covs)
