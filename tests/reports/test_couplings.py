@@ -122,10 +122,8 @@ def test_the_gap_of_a_plan_that_is_not_optimal_is_an_error(
 ) -> None:
     """A solver that returns another plan without a word."""
 
-    def solve_badly(
-        cost: np.ndarray, a: np.ndarray, b: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        return np.outer(a, b), np.zeros(b.size)
+    def solve_badly(cost: np.ndarray, a: np.ndarray, b: np.ndarray) -> solvers.Solution:
+        return solvers.Solution(np.outer(a, b), np.zeros(b.size))
 
     # The product of the masses is a plan, with potentials of zero.
     monkeypatch.setattr(solvers, "_solve_network", solve_badly)
