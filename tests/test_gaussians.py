@@ -545,3 +545,32 @@ def test_joseph_s_form_is_its_product_with_any_gain(d: int) -> None:
         scale = std[..., :, None] * std[..., None, :]
         assert (np.abs(found - expected) / scale).max() < 1e-11
         np.testing.assert_array_equal(found, found.mT)
+
+
+@pytest.mark.parametrize("rule", ["min_trace", "min_determinant"])
+def test_a_pair_s_weight_is_that_of_a_search_over_matrices(rule: str) -> None:
+    """Random pairs, some with the optimum at an end; a third source that is absent is no source."""
+    rng = np.random.default_rng(5)
+    roots = rng.standard_normal((20, 2, 3, 3)) * rng.uniform(0.2, 5.0, (20, 2, 3, 1))
+    covs = roots @ roots.mT
+    covs[:4, 1] = 1.5 * covs[:4, 0]
+    covs[4] = covs[4, 0]
+    weights = intersection_weights(covs, rule=rule)
+    third = np.concatenate(
+        [covs[:, :1], np.full((20, 1, 3, 3), np.nan), covs[:, 1:]], 1
+    )
+    present = np.array([True, False, True])
+    with_absent = intersection_weights(third, rule=rule, present=present)
+    np.testing.assert_array_equal(with_absent[:, ::2], weights)
+    np.testing.assert_array_equal(with_absent[:, 1], 0.0)
+    np.testing.assert_array_equal(weights[:4], [[1.0, 0.0]] * 4)
+    np.testing.assert_array_equal(weights[4], [0.5, 0.5])
+    # Each result is as small as the best on a fine grid.
+    grid = np.linspace(0.0, 1.0, 2001)
+    for pair, weight in zip(np.linalg.inv(covs), weights, strict=True):
+        candidates = np.append(grid, weight[1])[:, None, None]
+        fused = np.linalg.inv((1 - candidates) * pair[0] + candidates * pair[1])
+        sizes = np.linalg.slogdet(fused)[1]
+        if rule == "min_trace":
+            sizes = np.log(np.trace(fused, axis1=-2, axis2=-1))
+        assert sizes[-1] <= sizes[:-1].min() + 1e-7

@@ -207,6 +207,12 @@ def intersection_weights(
     within :math:`10^{-7}d` of the least, the trace within a fraction of :math:`10^{-7}`. After 60
     steps, where rounding hides the gap, the weights with the smallest gap are returned.
 
+    *Two sources.* In the coordinates in which :math:`\mathbf P_1` is the identity and
+    :math:`\mathbf P_2^{-1}` diagonal with the entries :math:`\lambda_i`, the determinant is
+    :math:`\prod_iu_i^{-1}` and the trace :math:`\sum_ic_iu_i^{-1}` with
+    :math:`u_i=1-\omega+\omega\lambda_i`. So matrices are decomposed once, and the search for
+    :math:`\omega=\omega_2` needs numbers only.
+
     Examples
     --------
     >>> intersection_weights([[[1.0]], [[3.0]]], rule="trace")
@@ -224,7 +230,7 @@ def intersection_weights(
     covs = np.broadcast_to(covs, (*leading, *covs.shape[-3:]))
     covs = _fill_absent(covs, present, 2, "covs")
     if rule in ("min_trace", "min_determinant") and present.shape[-1] > 1:
-        return _minimize(covs, present, determinant=rule == "min_determinant")
+        return _search_weights(covs, present, determinant=rule == "min_determinant")
     # ω_b ∝ 1 / size_b, by logarithms.
     log_sizes = np.zeros(present.shape)
     if rule == "trace":
@@ -234,6 +240,26 @@ def intersection_weights(
     log_sizes = np.where(present, log_sizes, np.inf)
     weights = np.exp(log_sizes.min(axis=-1, keepdims=True) - log_sizes)
     return np.asarray(weights / weights.sum(axis=-1, keepdims=True))
+
+
+def _search_weights(covs: Array, present: Mask, *, determinant: bool) -> Array:
+    """Weights of least determinant or trace: of two present sources by their eigenvalues."""
+    s, d = covs.shape[-3:-1]
+    flat_covs = covs.reshape(-1, s, d, d)
+    flat_present = present.reshape(-1, s)
+    is_pair = np.count_nonzero(flat_present, axis=-1) == 2
+    weights = np.zeros(flat_present.shape)
+    if is_pair.any():
+        # Which two they are, (pairs, 2)
+        sources = np.nonzero(flat_present[is_pair])[1].reshape(-1, 2)
+        rows = np.flatnonzero(is_pair)[:, None]
+        pair = flat_covs[rows, sources]
+        weights[rows, sources] = _minimize_pair(pair, determinant=determinant)
+    if not is_pair.all():
+        weights[~is_pair] = _minimize(
+            flat_covs[~is_pair], flat_present[~is_pair], determinant=determinant
+        )
+    return weights.reshape(present.shape)
 
 
 @dataclass
@@ -348,6 +374,65 @@ def _minimize(covs: Array, present: Mask, *, determinant: bool) -> Array:
             monotone = monotone[is_open]
             step_size = step_size[is_open]
     return np.asarray(best.reshape(present.shape))
+
+
+# Where ratios of covariances overflow, the duality gap is NaN and no step is taken.
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")
+def _minimize_pair(covs: Array, *, determinant: bool) -> Array:
+    """Weights (n, 2) of least determinant or trace for pairs of covariances, (n, 2, d, d)."""
+    lower = cholesky(covs)
+    first_lower = lower[:, 0]
+    # L₂⁻¹ L₁ = U diag(√λ) Vᵀ: in the coordinates Vᵀ L₁⁻¹ x the information is I and diag(λ).
+    _, root, axes = np.linalg.svd(solve_lower(lower[:, 1], first_lower))
+    eigenvalues = root * root
+    # The objective is Σ c_i / u_i for the trace, with c_i = |L₁ v_i|², and -Σ log u_i for the
+    # determinant. Its slope in ω has the sign of 1 - g with the mean g = Σ s_i λ_i of weights
+    # s_i ∝ c_i / u_i², and s_i ∝ 1 / u_i.
+    size = np.ones_like(eigenvalues)
+    power = 1
+    if not determinant:
+        size = ((first_lower @ axes.mT) ** 2).sum(axis=-2)
+        power = 2
+    # log(ω₂ / ω₁), and an interval that holds it: its ends are weights of rounding.
+    log_odds = np.zeros(len(covs))
+    low = np.full(len(covs), -40.0)
+    high = np.full(len(covs), 40.0)
+    # The slope at ω = 0 and at ω = 1: one that points outwards is the optimum.
+    weight = np.full(len(covs), np.nan)
+    weight[_average(eigenvalues, size) <= 1] = 0.0
+    weight[_average(eigenvalues, size / eigenvalues**power) >= 1] = 1.0
+    is_inside = np.isnan(weight)
+    for _ in range(_MAX_STEPS):
+        odds = np.exp(log_odds)
+        current = odds / (1 + odds)
+        # u_i / ω₁, and the second source's part of u_i
+        information = 1 + odds[:, None] * eigenvalues
+        part = 1 - 1 / information
+        shares = size / information**power
+        mean = _average(eigenvalues, shares)
+        duality_gap = np.maximum(1.0, mean) / (1 - current + current * mean) - 1
+        is_open = duality_gap > _GAP_TOLERANCE
+        if not (is_open & is_inside).any():
+            break
+        # Newton's method for log g = 0, which falls as the odds rise.
+        error = np.log(mean)
+        low = np.where(error > 0, log_odds, low)
+        high = np.where(error < 0, log_odds, high)
+        centred = (eigenvalues - mean[:, None]) * part
+        slope = power * _average(centred, shares) / mean
+        newton = log_odds + error / slope
+        is_between = (low < newton) & (newton < high)
+        step = np.where(is_between, newton, 0.5 * (low + high))
+        log_odds = np.where(is_open & is_inside, step, log_odds)
+    # Equal covariances, up to rounding, have equal weights.
+    is_equal = log_odds == 0
+    weight = np.where(is_inside | (is_equal & ~is_open), current, weight)
+    return np.stack([1 - weight, weight], axis=-1)
+
+
+def _average(values: Array, shares: Array) -> Array:
+    """Average of values (..., d), weighted by shares that need not sum to one, (...)."""
+    return np.asarray((shares * values).sum(axis=-1) / shares.sum(axis=-1))
 
 
 def _decrease_bound(value: Array, predicted: Array) -> Array:
