@@ -142,7 +142,7 @@ class Shown:
     value: float
     where: str
     section: int = -1
-    """The section that shows it; -1 for a picture and for what is outside the page."""
+    """The section that shows it; -1 for a picture and for values from outside the page."""
     labels: frozenset[str] = frozenset()
     """The labels of its section and its picture."""
     name: frozenset[str] = frozenset()
@@ -420,7 +420,7 @@ def code_numbers(
     lines = ["", *code.splitlines()]
 
     def walk(node: ast.AST, name: str) -> Iterator[Shown]:
-        # A number is named by what it is assigned to, or by the text beside it.
+        # A number is named by the variable that it is assigned to, or by the text beside it.
         match node:
             case ast.Assign():
                 name = " ".join(map(ast.unparse, node.targets))
@@ -494,7 +494,7 @@ def scenario_numbers(path: Path) -> Iterator[Shown]:
 
 
 def texts_of_output(output: Any) -> Iterator[str]:
-    """Yield what an output prints, and the cells of its tables."""
+    """Yield the printed text of an output, and the cells of its tables."""
     data = output.get("data", {})
     page = data.get("text/html", "")
     # The text of a picture is a digest, whose digits prove nothing.
@@ -610,7 +610,7 @@ class Numbers:
 
 
 def texts_of(cell: Any) -> Iterator[str]:
-    """Yield the caption of a cell's picture, and what readers hear who do not see it."""
+    """Yield the caption of a cell's picture, and the alternative text that a screen reader reads."""
     options = cell.metadata.get("mystnb", {})
     yield options.get("figure", {}).get("caption", "")
     yield options.get("image", {}).get("alt", "")
@@ -650,7 +650,7 @@ def read_chapter(source: Path) -> tuple[list[Numeral], list[Shown]]:
             for text in texts_of(cell):
                 for numeral in numerals_of(text, section):
                     numerals.append(replace(numeral, labels=numeral.labels | own))
-            # Sizes and limits of a picture are not what the text speaks of.
+            # The text does not speak of sizes and limits of a picture.
             drawn = "figure" in options
             code_section, code_labels = (-1, own) if drawn else (section, labels)
             numbers += code_numbers(cell.source, where, code_section, code_labels)
