@@ -610,7 +610,7 @@ class Numbers:
 
 
 def texts_of(cell: Any) -> Iterator[str]:
-    """Yield the caption of a cell's picture, and the alternative text that a screen reader reads."""
+    """Yield the caption of a cell's picture, and the alternative text for screen readers."""
     options = cell.metadata.get("mystnb", {})
     yield options.get("figure", {}).get("caption", "")
     yield options.get("image", {}).get("alt", "")
