@@ -78,7 +78,9 @@ def turning(*, sigma: float, turn_sigma: float) -> Model:
         jacobian = np.zeros((*x.shape, 5))
         jacobian[..., :2, :2] = one
         jacobian[..., 4, 4] = 1.0
+        # ∫ R(ω s) ds = dt (sin τ/τ I + (1 - cos τ)/τ N), with N a quarter turn and τ = ω dt
         jacobian[..., :2, 2:4] = dt * (sine * one + cosine * normal)
+        # R(τ) = cos τ I + sin τ N
         jacobian[..., 2:4, 2:4] = np.cos(tau) * one + np.sin(tau) * normal
         # Derivatives in the turn rate: of the position, and of the velocity
         bent = (np.cos(tau) - sine) * one + (np.sin(tau) - cosine) * normal

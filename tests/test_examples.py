@@ -190,18 +190,19 @@ def test_recipes_agree_with_values_from_elsewhere(
     rows = table("recipe values\n" + capsys.readouterr().out)
     # The delayed observation, assimilated in the order of time.
     f = GaussianFilter(names["WALK"], [component([0], std=1.0)])
-    in_order = f.run(
-        f.start(names["PRIOR"]), [1.4, 2.0, 3.0], [[[0.5], [1.0], [np.nan]]]
-    )
+    start = f.start(names["PRIOR"])
+    in_order = f.run(start, [1.4, 2.0, 3.0], [[[0.5], [1.0], [np.nan]]])
     mean = in_order["mean"].values[-1, 0]
     assert np.allclose(rows["delayed_observation"], mean, atol=5e-4)
-    # A robot at 3 ± 2 that is measured at 3.5 ± 1, and a landmark 5 ± 0.1 ahead.
+    # A robot at 3 ± 2 that is measured at 3.5 ± 1, and a landmark 5 ± 0.1 ahead: with K = 4/5
+    # 3 + 0.5 K and 5 more, variances of K and K + 0.1².
     assert rows["first_sight"] == [3.4, 8.4, 0.8, 0.81]
     # Both observations of (place, first bias, second bias), in one linear regression.
     design = np.array([[1.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
     information = np.diag([1.0, 1.0, 4.0]) + design.T @ design
     place, *_ = np.linalg.solve(information, design.T @ np.ones(2))
     assert np.allclose(rows["restart"], place, atol=5e-4)
+    # (m/P + 2 + 3) / (1/P + 2) for (m, P) = (0, 1) and (4, 2)
     assert rows["priors_of_agents"] == [1.667, 2.8]
     # The Kalman filter of matrices, with the same three steps.
     ends = np.array([0.0, 0.3, 1.0, 2.0])
@@ -210,6 +211,7 @@ def test_recipes_agree_with_values_from_elsewhere(
     y = np.array([[np.nan], [np.nan], [0.5]])
     exact = kalman_filter([1.0], one, y, F=steps, H=one, Q=0 * one, R=one)
     assert np.allclose(rows["matrix_of_time"], exact.means[-1], atol=5e-4)
+    # At 2 m/s, the start is the mean of the prior's 0, of 2.3 - 2 and of 4.6 - 4.
     assert rows["known_constant"] == [4.3, 2.0, 0.333, 0.0]
     # Samples of the robot's drive: the linear covariance is that for small errors.
     rng = np.random.default_rng(0)
@@ -223,12 +225,12 @@ def test_recipes_agree_with_values_from_elsewhere(
     assert np.allclose(rows["odometry"], sampled, rtol=0.05)
     # The gamma distribution is conjugate to counts; Student's t resists the outlier.
     counts, student, radar = rows["likelihoods"]
+    # A count of 9 makes Γ(16, rate 4) to Γ(25, rate 5).
     assert abs(counts - 25 / 5) < 0.02
     assert student < 5 < radar < 6
     # The evidence by the chain rule, one scalar Kalman filter.
-    assert np.allclose(
-        rows["evidence"], chain_rule([1, 1, 2], [0.2, 1.1, -0.9]), atol=5e-4
-    )
+    evidence = chain_rule([1, 1, 2], [0.2, 1.1, -0.9])
+    assert np.allclose(rows["evidence"], evidence, atol=5e-4)
 
 
 def chain_rule(steps: list[float], observed: list[float]) -> tuple[float, float]:

@@ -134,7 +134,9 @@ def test_extreme_precision_does_not_spoil_the_rest() -> None:
     nearly_equal = (1 + np.eye(2) * 2.0**-52) / 16
     p = [np.eye(2), nearly_equal]
     _, cov = intersect_gaussians(np.zeros((2, 2)), p, [0.75, 0.25])
-    assert np.isclose(cov.sum(), 2 / (0.75 + 0.25 / 0.125))
+    # Along (1, 1)/√2 the variances are 1 and 2/16, and 1ᵀ P 1 is twice the fused one.
+    information = 0.75 + 0.25 / 0.125
+    assert np.isclose(cov.sum(), 2 / information)
 
 
 # --- weights ----------------------------------------------------------------------------------
@@ -289,7 +291,8 @@ def test_optimal_weights_of_crossed_repeated_and_dominated_sources() -> None:
         assert w[0] > 1 - 1e-4
         # By symmetry one half each; two copies share theirs.
         w = intersection_weights([first, first, second], rule=rule)
-        assert np.allclose([w[:2].sum(), w[2]], 0.5, atol=1e-6)
+        of_copies = w[:2].sum()
+        assert np.allclose([of_copies, w[2]], 0.5, atol=1e-6)
 
 
 @pytest.mark.parametrize("bad", [NAN, np.inf])
@@ -531,46 +534,55 @@ def test_joseph_s_form_is_accurate_for_a_nearly_exact_observation() -> None:
 def test_joseph_s_form_is_its_product_with_any_gain(d: int) -> None:
     """Small and large states, whose products are ordered differently; also far from the optimum."""
     rng = np.random.default_rng(d)
-    root = rng.standard_normal((3, d, d)) * np.geomspace(1e-3, 1e3, d)[:, None]
+    units = np.geomspace(1e-3, 1e3, d)
+    root = rng.standard_normal((3, d, d)) * units[:, None]
     cov = root @ root.mT
     slope = rng.standard_normal((2, d))
     noise = np.diag([0.5, 2.0])
     innovation_cov = slope @ cov @ slope.T + noise
     optimal = np.linalg.solve(innovation_cov, slope @ cov).mT
     for gain in (optimal, 0.3 * optimal):
-        rest = np.eye(d) - gain @ slope
-        expected = rest @ cov @ rest.mT + gain @ noise @ gain.mT
-        found = joseph(cov, gain, slope, noise)
+        # (I - K H) P (I - K H)ᵀ + K R Kᵀ
+        factor = np.eye(d) - gain @ slope
+        expected = factor @ cov @ factor.mT + gain @ noise @ gain.mT
+        result = joseph(cov, gain, slope, noise)
         std = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
         scale = std[..., :, None] * std[..., None, :]
-        assert (np.abs(found - expected) / scale).max() < 1e-11
-        np.testing.assert_array_equal(found, found.mT)
+        relative_error = np.abs(result - expected) / scale
+        assert relative_error.max() < 1e-11
+        np.testing.assert_array_equal(result, result.mT)
 
 
 @pytest.mark.parametrize("rule", ["min_trace", "min_determinant"])
 def test_a_pair_s_weight_is_that_of_a_search_over_matrices(rule: str) -> None:
     """Random pairs, some with the optimum at an end; a third source that is absent is no source."""
     rng = np.random.default_rng(5)
-    roots = rng.standard_normal((20, 2, 3, 3)) * rng.uniform(0.2, 5.0, (20, 2, 3, 1))
+    normal = rng.standard_normal((20, 2, 3, 3))
+    lengths = rng.uniform(0.2, 5.0, (20, 2, 3, 1))
+    roots = normal * lengths
     covs = roots @ roots.mT
     covs[:4, 1] = 1.5 * covs[:4, 0]
     covs[4] = covs[4, 0]
     weights = intersection_weights(covs, rule=rule)
-    third = np.concatenate(
-        [covs[:, :1], np.full((20, 1, 3, 3), np.nan), covs[:, 1:]], 1
-    )
+    absent = np.full((20, 1, 3, 3), np.nan)
+    third = np.concatenate([covs[:, :1], absent, covs[:, 1:]], axis=1)
     present = np.array([True, False, True])
     with_absent = intersection_weights(third, rule=rule, present=present)
     np.testing.assert_array_equal(with_absent[:, ::2], weights)
     np.testing.assert_array_equal(with_absent[:, 1], 0.0)
+    # Of P and 1.5 P the smaller one has all the weight; two equal ones share it.
     np.testing.assert_array_equal(weights[:4], [[1.0, 0.0]] * 4)
     np.testing.assert_array_equal(weights[4], [0.5, 0.5])
     # Each result is as small as the best on a fine grid.
     grid = np.linspace(0.0, 1.0, 2001)
     for pair, weight in zip(np.linalg.inv(covs), weights, strict=True):
-        candidates = np.append(grid, weight[1])[:, None, None]
-        fused = np.linalg.inv((1 - candidates) * pair[0] + candidates * pair[1])
+        # P(ω) = ((1 - ω) P₁⁻¹ + ω P₂⁻¹)⁻¹ for all ω of the grid, and for the result at last
+        omega = np.append(grid, weight[1])[:, None, None]
+        information = (1 - omega) * pair[0] + omega * pair[1]
+        fused = np.linalg.inv(information)
         sizes = np.linalg.slogdet(fused)[1]
         if rule == "min_trace":
-            sizes = np.log(np.trace(fused, axis1=-2, axis2=-1))
-        assert sizes[-1] <= sizes[:-1].min() + 1e-7
+            traces = np.trace(fused, axis1=-2, axis2=-1)
+            sizes = np.log(traces)
+        least = sizes[:-1].min()
+        assert sizes[-1] <= least + 1e-7

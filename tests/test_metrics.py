@@ -121,7 +121,10 @@ def test_intervals_have_their_level(n, level):
         # One tail beyond each end, but for the ends 0 and 1
         above = stats.binom.sf(k - 1, n, ours.low)
         below = stats.binom.cdf(k, n, ours.high)
-        assert (above, below) == pytest.approx((tail if k else 1, tail if k < n else 1))
+        expected_above = tail if k > 0 else 1
+        expected_below = tail if k < n else 1
+        assert above == pytest.approx(expected_above)
+        assert below == pytest.approx(expected_below)
         assert (ours.low == 0) == (k == 0)
         assert (ours.high == 1) == (k == n)
         # √(p (1 - p) / n)

@@ -117,8 +117,8 @@ def _decode(
         densities = densities @ snapshot.grid.cosines(modes).T
     # The last value is 1 for the leader and 0 for all others, so its average is 1/N. Before the
     # consensus has converged it may be zero or negative: 1 to a million agents are believed.
-    agents = 1 / np.clip(values[:, -1], 1e-6, 1.0)
-    return densities, agents
+    n_agents = 1 / np.clip(values[:, -1], 1e-6, 1.0)
+    return densities, n_agents
 
 
 @dataclass(frozen=True)
@@ -166,10 +166,16 @@ class PIConsensus(FrozenModel, ConsensusProtocol):
     def update(
         self, memory: Memory, snapshot: SwarmSnapshot, channel: Channel, dt: float
     ) -> Update:
-        """Integrate (16) of Zheng and Lin over `dt`, in as many substeps as stability needs."""
+        """Integrate (16) of Zheng and Lin over `dt`, in as many substeps as stability needs.
+
+        Each agent's input is its kernel, on all cells or as `modes` cosine coefficients, and an
+        indicator whose average counts the agents. The memory holds the estimates, the integrals and
+        the inputs, see :meth:`initial_state`.
+        """
         estimates, integrals, previous = memory
         inputs = _encode(snapshot, self.modes, snapshot.kernels)
-        # The estimates follow the average of the previous inputs.
+        # Explicit Euler steps take the inputs of their beginning: those of the previous positions.
+        # The new inputs, of the end of the step, enter by the rate, if at all.
         state = pi_step(
             PIState(estimates, integrals),
             previous,
@@ -181,8 +187,8 @@ class PIConsensus(FrozenModel, ConsensusProtocol):
             rate=(inputs - previous) / dt if self.rate else None,
         )
         # The memory holds encoded values; the estimates are decoded from them.
-        densities, agents = _decode(state.estimate, snapshot, self.modes)
-        return (state.estimate, state.integral, inputs), densities, agents
+        densities, n_agents = _decode(state.estimate, snapshot, self.modes)
+        return (state.estimate, state.integral, inputs), densities, n_agents
 
 
 class BiasedAverage(RuntimeWarning):

@@ -145,7 +145,12 @@ def _forecast(
     *,
     reuse_rng: bool,
 ) -> AnyState:
-    """Return the forecast at `t`, without an exchange."""
+    """Return the state at the end `t` of a step, into which an observation's time is inserted then.
+
+    It is the forecast alone: the step itself, which follows with a length of zero, has the exchange
+    and the observations.
+    """
+    # From the end of the step on there is no place between two times.
     if t_obs >= t:
         return state
     if f.exchange_interval is not None:
@@ -153,8 +158,11 @@ def _forecast(
             f"delayed must be of times up to the state's own, {format_number(state.t)}, for "
             f"agents that exchange at intervals, got {format_number(t_obs)}"
         )
-    quiet = f.replace(graph=None)
-    return quiet._advance(state, t, [None] * f.n_agents, (), reuse_rng=reuse_rng)
+    # The same filter without a network sends nothing.
+    without_graph = f.replace(graph=None)
+    return without_graph._advance(
+        state, t, [None] * f.n_agents, (), reuse_rng=reuse_rng
+    )
 
 
 class Gap(NamedTuple):

@@ -146,7 +146,11 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
     def _average_information(
         self, step: Step[GaussianState], means: Array, covs: Array, own: Array
     ) -> Array:
-        """Return the packed information of forecasts and observations after the consensus."""
+        """Return the packed information of forecasts and observations after the consensus.
+
+        `own` (*runs, A, n) is δΩ, the information of each agent's own observations, packed as n
+        numbers; Ω is that of its forecast.
+        """
 
         def compute(m: Array, p: Array, *_: object) -> tuple[Array]:
             return (pack_information(*to_information(m, p)),)
@@ -157,9 +161,9 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
             # A ⟨Ω / A + δΩ⟩
             (averaged,) = step.fuse(prior / self.n_agents + own)
             return self.n_agents * averaged
+        # Both are averaged in the same messages, side by side: ⟨Ω⟩ + ω ⟨δΩ⟩.
         (averaged,) = step.fuse(np.concatenate([prior, own], axis=-1))
         half = own.shape[-1]
-        # ⟨Ω⟩ + ω ⟨δΩ⟩
         return np.asarray(averaged[..., :half] + self._omega * averaged[..., half:])
 
     def _find_gaussians(

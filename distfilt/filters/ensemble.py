@@ -374,6 +374,7 @@ class EnsembleFilter(
             # The places of the observations come behind the members of all times.
             places = arrays.pop() if located else None
             *past, present = arrays
+            # The group predicts for all rows, not for one alone, as after an error in the batch.
             predict_again = predict if h.shape == predicted.shape else None
             # All times' members meet the same draws, so that the separate updates are one joint
             # update; the last of them advances the generator.
@@ -427,46 +428,81 @@ class EnsembleFilter(
 
     def _update(
         self,
-        x: Array,
-        h: Array,
-        y: Array,
+        members: Array,
+        predicted: Array,
+        observed: Array,
         noise: Array,
         rng: Rng,
         *,
         predict: Callable[[Array], Array] | None,
         places: Array | None,
     ) -> Array:
-        """Update ensembles (..., G, N, d); a plain function gets one agent's at a time."""
+        """Update the ensembles of G agents, together if the update can do that.
+
+        Parameters
+        ----------
+        members, predicted, observed : ndarray, (..., G, N, d), (..., G, N, m), (..., G, m)
+            Members, their predictions and what was observed. Without the axis of agents if one
+            ensemble is computed again by itself, after an error in a batch.
+        noise : ndarray, (m, m) or (G, m, m)
+            The covariance of the observations' noise, one for all agents or each agent's.
+        rng : numpy.random.Generator
+        predict : callable or None
+            Predicts the observations of members (..., N, d), for an update that moves the members
+            several times; None if it has to do without.
+        places : ndarray or None
+            The places of the observations, for an update that is localised by them.
+        """
         if self._repredicts:
+            # It takes ensembles of several agents, and missing observations, by itself.
             options = {} if places is None else {"observation_places": places}
             new = call_user(
-                self.update, x, h, y, noise, rng=rng, predict=predict, **options
+                self.update,
+                members,
+                predicted,
+                observed,
+                noise,
+                rng=rng,
+                predict=predict,
+                **options,
             )
             return new
         if self._stacks:
-            new = with_missing(self.update, x, h, y, noise, rng=rng)
-            _check_shape(new, "update", x.shape)
+            # The library's updates take all ensembles in one call, each with its own noise.
+            new = with_missing(
+                self.update, members, predicted, observed, noise, rng=rng
+            )
+            _check_shape(new, "update", members.shape)
             return new
-        if x.ndim == 2:
-            return self._update_one(x, h, y, noise, rng)
+        # A function of the user's gets one agent's ensemble, and one covariance, at a time.
+        if members.ndim == 2:
+            return self._update_one(members, predicted, observed, noise, rng)
         updated = []
-        for g in range(x.shape[-3]):
-            one_noise = noise[g] if noise.ndim > 2 else noise
+        for g in range(members.shape[-3]):
             updated.append(
                 self._update_one(
-                    x[..., g, :, :], h[..., g, :, :], y[..., g, :], one_noise, rng
+                    members[..., g, :, :],
+                    predicted[..., g, :, :],
+                    observed[..., g, :],
+                    noise[g] if noise.ndim > 2 else noise,
+                    rng,
                 )
             )
         return np.stack(updated, axis=-3)
 
     def _update_one(
-        self, x: Array, h: Array, y: Array, noise: Array, rng: Rng
+        self, members: Array, predicted: Array, observed: Array, noise: Array, rng: Rng
     ) -> Array:
         """Update one agent's ensembles by the user's function, which may work in place."""
         new = with_missing(
-            self.update, x.copy(), h.copy(), y.copy(), noise.copy(), rng=rng
+            self.update,
+            members.copy(),
+            predicted.copy(),
+            observed.copy(),
+            noise.copy(),
+            rng=rng,
         )
-        return check_array(new, "update", x.shape, finite=False)
+        return check_array(new, "update", members.shape, finite=False)
 
 
 def _check_shape(values: Array, name: str, shape: tuple[int, ...]) -> None:

@@ -196,14 +196,19 @@ def _flood(
 ) -> Sequence[Mapping[int, Payload]]:
     """Send observations over several links; the values that each agent receives, by their agent.
 
-    The number of the agent that made them travels with them.
+    The number of the agent that made them travels with them, since a receiver does not know it from
+    the link by which they come. Behind it are time, sensor and metadata of each observation, unless
+    these go without saying.
     """
     bundles: list[tuple[Array, ...] | None] = []
     labels = []
-    for agent, numbers in enumerate(_describe(step, sent)):
+    for agent, description in enumerate(_describe(step, sent)):
         values = tuple([observation.value for observation in sent[agent]])
+        # An agent without observations sends nothing of its own.
         bundles.append(values or None)
-        labels.append(np.array([agent, *numbers], dtype=float))
+        # As numbers, which the channel counts.
+        labels.append(np.array([agent, *description], dtype=float))
+    # How many links an observation travels at most
     hops = step.filter.hops
     limit = None if hops == "all" else hops
     return flood_observations(step.channel, bundles, labels, limit)

@@ -244,8 +244,11 @@ class GaussianFamily(
         """
         if self.periods:
             # The mean of each time by itself: a covariance does not depend on the branch.
+            # They stand behind one another, with the same periods.
             n_times = means.shape[-1] // self.model.dim
             means = wrap_differences(means, self.periods * n_times)
+        # The joint moments begin with the present and go back in time, and so does the history. A
+        # step lists its times from the oldest on.
         return step.end(
             joint_means=means,
             joint_covariances=covs,

@@ -248,14 +248,29 @@ class InformationIncrementFilter(TargetMixtureFilter):
         unsent: list[GaussianMixture | None],
         step: Step[MixtureState],
     ) -> None:
-        """Send the increments, and assimilate those that are received, in place."""
+        """Send the increments, and assimilate those that are received, in place.
+
+        Parameters
+        ----------
+        outgoing : list of (ndarray or None)
+            Each agent's increment as numbers, if it sends one.
+        after : list of GaussianMixture
+            Each agent's belief after its own observations.
+        unsent : list of (GaussianMixture or None)
+            Its belief without the information that it still has to send; None if it has sent all.
+            What it receives counts for both beliefs: the next increment, which is their difference,
+            must hold its own information only.
+        step : Step
+        """
         inbox = step.channel.broadcast(outgoing)
         # Each agent assimilates the increments in the order of their senders.
         for sender in range(len(after)):
             receivers = [a for a, messages in enumerate(inbox) if sender in messages]
             if receivers:
-                # z = H t + unit noise, as the sender's observations.
-                increment = _unpack(inbox[receivers[0]][sender], self.target_dim)
+                # A broadcast is the same message for all of its receivers. It says H and z, an
+                # observation z = H x + e of the target's state x, with e ~ N(0, I).
+                message = inbox[receivers[0]][sender]
+                increment = _unpack(message, self.target_dim)
                 self._add_to_all(increment, receivers, after, unsent, step)
 
     def _add_to_all(

@@ -138,6 +138,8 @@ class ParticleFamily(MembersFilter[ParticleState]):
             stack = [fold(paths, self.periods, weights) for paths in stack]
         past, fused = self._fuse(log_weights, stack, ancestors, step)
         if self.periods:
+            # An agent's particles are shifted alike, by whole periods, so that their mean is in
+            # [-period/2, period/2).
             weights = np.exp(log_weights)
             fused = settle(fused, self.periods, weights)
             past = [settle(paths, self.periods, weights) for paths in past]
@@ -259,6 +261,13 @@ class ParticleFamily(MembersFilter[ParticleState]):
     ) -> _Resampling:
         """Resample agents with a small effective size: the stack in place.
 
+        Resampling leaves copies of particles, which count as one until noise separates them. That
+        is the noise of the jitter, if it has a bandwidth. Otherwise it is the process noise, and
+        where few ancestors are left, it is tested whether that is enough: a *family* are the
+        particles that descend from one ancestor, and families that the noise has not spread are
+        worth few independent particles, see :func:`measure_families`. Then noise is added for what
+        is missing, unless the user has chosen the jitter.
+
         >>> from distfilt.models import constant_velocity
         >>> f = ParticleFilter(
         ...     constant_velocity(sigma=1.0),
@@ -281,6 +290,7 @@ class ParticleFamily(MembersFilter[ParticleState]):
         """
         log_weights = state.log_weights.copy()
         ancestors = find_ancestors(state)
+        # The present particles; before them the stack holds those of earlier times.
         before = stack[-1]
         # Every agent draws, also if it does not resample: its numbers must not depend on
         # another's weights.
@@ -291,28 +301,31 @@ class ParticleFamily(MembersFilter[ParticleState]):
         is_due = state.effective_size < self.ess_threshold * self.members
         if not np.count_nonzero(is_due):
             return _Resampling(log_weights, ancestors)
-        is_few = is_due & self._has_few_ancestors(ancestors)
-        is_few[state.failed] = False
-        if noise is None and not np.count_nonzero(is_few):
+        is_tested = is_due & self._has_few_ancestors(ancestors)
+        is_tested[state.failed] = False
+        if noise is None and not np.count_nonzero(is_tested):
             # The usual case: no copies to separate, no families to look into.
             self._select(stack, log_weights, state.weights, is_due, offset, ancestors)
             return _Resampling(log_weights, ancestors)
+        # An agent's particles have to be worth so many independent ones: a fiftieth of them, within
+        # the bounds `_FEWEST` and `_ENOUGH`.
         least = min(max(_FEWEST, 0.02 * self.members), _ENOUGH)
-        sizes, shares = measure_families(
-            before, state.weights, ancestors, is_few, least
+        # How many they are worth, and which share of their variance lies within families; infinity
+        # and one for agents that are not tested.
+        worths, shares_within = measure_families(
+            before, state.weights, ancestors, is_tested, least
         )
-        is_renewed = is_few & (shares > 0.5)
-        is_collapsed = sizes < least
+        # A family that is as wide as the families lie apart is no clone of one particle any more.
+        is_renewed = is_tested & (shares_within > 0.5)
+        is_collapsed = worths < least
         counts = self._select(
             stack, log_weights, state.weights, is_due, offset, ancestors
         )
         if noise is None and self.jitter is None and is_collapsed.any():
-            # The noise is too small to separate copies. A generator of its own, so that the
-            # draws of the others do not change.
-            words = copy_rng(step.rng).bit_generator.random_raw(4).tolist()
-            noise = np.random.default_rng(words).standard_normal(before.shape)
-            # The variance of the noise is in proportion to what is missing, (least - n) / least.
-            missing = np.where(is_collapsed, 1 - sizes / least, 0.0)
+            # The process noise is too small to separate copies. The variance of the noise that is
+            # added is in proportion to what is missing, (least - n) / least.
+            missing = np.where(is_collapsed, 1 - worths / least, 0.0)
+            noise = _draw_separately(step.rng, before.shape)
             noise *= np.sqrt(missing)[..., None, None]
             bandwidth = particles.silverman(self.members, self.model.dim)
         if noise is not None:
@@ -324,9 +337,11 @@ class ParticleFamily(MembersFilter[ParticleState]):
                 noise[is_due],
                 bandwidth,
             )
-        # Families begin anew once the noise has separated their members.
+        # Families begin anew once the noise has separated their members: every particle is its own
+        # ancestor.
         ancestors[is_renewed] = np.arange(self.members)
-        worth = float(sizes.min(initial=np.inf))
+        # The agent that is worst off decides about a warning.
+        worth = float(worths.min(initial=np.inf))
         return _Resampling(log_weights, ancestors, worth)
 
     def _separate_copies(
@@ -517,6 +532,15 @@ class _Resampling(NamedTuple):
     log_weights: Array
     ancestors: Indices
     worth: float = np.inf
+
+
+def _draw_separately(rng: Rng, shape: tuple[int, ...]) -> Array:
+    """Draw standard normal numbers by a generator seeded from `rng`, which does not advance.
+
+    Draws that only some steps need do not change those of the other agents and steps.
+    """
+    words = copy_rng(rng).bit_generator.random_raw(4).tolist()
+    return np.random.default_rng(words).standard_normal(shape)
 
 
 def find_ancestors(state: ParticleState) -> Indices:

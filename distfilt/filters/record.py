@@ -263,7 +263,7 @@ def _collect_series(
     counts = [_read_ledgers([start.ledger])]
     first = 0
     last = start
-    for block in _blocks(believed, f.batched_summary):
+    for block in _gather_blocks(believed, f.batched_summary):
         # The ledgers are those of the states, the estimates those of the (smoothed) beliefs.
         states = [state for state, _belief in block]
         counts.append(_read_ledgers([state.ledger for state in states]))
@@ -390,13 +390,13 @@ def _read_summary(summary: Summary) -> dict[str, Array]:
     return row
 
 
-def _blocks(
+def _gather_blocks(
     believed: Iterable[Believed[AnyState]], batched: bool
 ) -> Iterator[list[Believed[AnyState]]]:
     """Yield small states of one shape together, so that one call summarizes them."""
 
     def shape_of(pair: Believed[AnyState]) -> tuple[int, ...]:
-        # One block for each state if they cannot be stacked.
+        # States that cannot be stacked get a block each: a size that fills it.
         return cast(SensorState, pair[1]).belief.shape if batched else (_BLOCK_SIZE,)
 
     for shape, same_shape in groupby(believed, shape_of):

@@ -126,14 +126,23 @@ def reset_members(
     draw_normal: Callable[[tuple[int, ...], np.random.Generator], Array],
     rng: np.random.Generator,
 ) -> Members:
-    """Return a state of members with new present components; the past keeps the former ones."""
+    """Return a state of members with new present components; the past keeps the former ones.
+
+    The belief about the present is one array of members (*runs, A, N, d). Those about earlier times
+    are in a field of their own, the state's history, which stays as it is.
+
+    `draw_normal` draws standard normal numbers for all agents; with one agent's only, an axis of
+    length 1, all agents have the same draws.
+    """
     name, _axes = state.belief_field
     members = state.belief.copy()
-    # e = L z, drawn for all agents, so that an agent's draws do not depend on which are chosen.
-    normal = draw_normal((*members.shape[:-1], len(reset.components)), rng)
-    noise = np.broadcast_to(
-        normal @ factor(reset.cov).T, (*members.shape[:-1], len(reset.components))
-    )
+    # e = L z with cov = L Lᵀ, as rows. It is drawn for all agents, so that an agent's draws do not
+    # depend on which are chosen.
+    shape = (*members.shape[:-1], len(reset.components))
+    normal = draw_normal(shape, rng)
+    # Draws that all agents have in common are repeated for each of them.
+    noise = np.broadcast_to(normal @ factor(reset.cov).T, shape)
+    # Indexing by a list of agents makes a copy, which is put back in the end.
     chosen = members[..., reset.agents, :, :]
     values = reset.value(chosen) + noise[..., reset.agents, :, :]
     chosen[..., reset.components] = values

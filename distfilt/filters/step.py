@@ -74,6 +74,16 @@ class Step(Generic[S]):
         Whether the filter has a fusion rule, and a channel to use it.
     rejected : ndarray, (*runs, A), or None
         How many observations the gate has rejected; None without a gate.
+    streaks : RejectionStreaks or None
+        How many observations in a row it has rejected, of each sensor; None without a gate.
+    unseen : ndarray, (*runs, A), or None
+        How many observations cannot be seen from the belief; None if all can.
+    pending : tuple of Observation
+        Observations that wait for the next contact, as nobody can send in this step.
+    references : References or None
+        The beliefs with which sensors of changes compare; None without such sensors.
+    warned : tuple of str
+        Keys of the warnings that have been given, each of them once.
     scores : dict of str to ndarray, (*runs, A)
         Scores of the observations, see :class:`~distfilt.filters.ScoresObservations`; empty if
         they are not recorded.
@@ -245,8 +255,10 @@ class Step(Generic[S]):
             for group in group_agents(by_time[t]):
                 if self.any_failed:
                     group = group.with_target(self.keep_failed(group.target, np.nan))
+                # Of a model with angles: the first prediction checks that the sensor knows of them.
                 if self.filter.periods:
                     group.circular_model = self.filter.model
+                # With a gate: which series of rejections in a row each observation goes on with
                 if self.streaks is not None:
                     group.streaks = self.streaks.list_numbers(t, group.agents)
                 yield place, group
@@ -518,52 +530,61 @@ class Step(Generic[S]):
 
     # The new state ---------------------------------------------------------------------
 
-    def end(self, *, past: Iterable[Array] = (), **belief: object) -> S:
-        """Return the state after the step.
+    def end(self, *, past: Iterable[Array] = (), **fields: object) -> S:
+        """Return the state after the step: the family's fields, and what all families keep.
 
         Parameters
         ----------
         past : iterable of ndarray
-            The beliefs about the earlier times.
-        **belief
-            The fields of the family's own.
+            The beliefs about the earlier times, in the order of `times`.
+        **fields
+            The fields of the family's own, such as the means of Gaussians.
         """
         state = self.state
+        # A long run keeps many states: a field with its default is left out, to take no place.
         if isinstance(state, SensorState):
+            # The lag keeps earlier times, and so do sensors of changes, which refer to them.
             if self.times or self.references is not None:
-                belief |= self._describe_past(past, belief)
-            belief["failed"] = self.failed
-            # A long run keeps many states: what has its default takes no place.
+                fields |= self._describe_past(past, fields)
+            fields["failed"] = self.failed
+            # How many observations each agent's belief could not have predicted
             if self.unseen is not None:
-                belief["unseen"] = self.unseen
+                fields["unseen"] = self.unseen
+            # Observations that wait until their agents can send
             if self.pending:
-                belief["pending"] = self.pending
+                fields["pending"] = self.pending
         if self.has_sensors:
-            belief["assimilated"] = self._note_assimilated()
+            # By these the next steps find observations that come a second time.
+            fields["assimilated"] = self._note_assimilated()
+            # The warnings that have been given, each of them once
             if self.warned:
-                belief["warned"] = self.warned
+                fields["warned"] = self.warned
+        # What the gate rejected: in a row, over several steps, and in this one
         if self.streaks is not None:
-            belief["rejection_streaks"] = self.streaks.counts
+            fields["rejection_streaks"] = self.streaks.counts
         if self.rejected is not None:
-            belief["rejected"] = self.rejected
+            fields["rejected"] = self.rejected
         # The messages in the step are in the channel's ledger.
         ledger = state.ledger if self.channel is None else self.channel.ledger
         # A failed run has no score.
         for name, values in self.scores.items():
             self.scores[name] = self.keep_failed(values, np.nan)
         new: S = type(state).construct(
-            self.t, ledger, self.rng, **self.scores, **belief
+            self.t, ledger, self.rng, **self.scores, **fields
         )
         return new
 
     def _describe_past(
-        self, past: Iterable[Array], belief: dict[str, object]
+        self, past: Iterable[Array], given: dict[str, object]
     ) -> dict[str, object]:
-        """Return the state's fields about the earlier times that the lag or a sensor keeps."""
+        """Return the state's fields about the earlier times that the lag or a sensor keeps.
+
+        `given` are those that the family gives by itself.
+        """
         pairs = list(zip(self.times, past, strict=False))
         fields: dict[str, object] = {}
         # A family may keep its past in its own form; otherwise it is (time, belief) pairs.
-        if "history" not in belief:
+        if "history" not in given:
             fields["history"] = tuple(
                 [pair for pair in pairs if pair[0] in self.lagged]
             )
@@ -1012,14 +1033,17 @@ class Received:
     def jacobian(self, states: Array, cov: Array | None = None) -> Array:
         """Return the derivatives of the observations at states (*runs, G, d), (*runs, G, M, d).
 
-        The states have the covariances `cov`, (*runs, G, d, d), which scale differences.
+        The states have the covariances `cov`, (*runs, G, d, d). Where a sensor has no derivative,
+        or one that has to be checked first, differences are taken, whose steps they scale.
         """
         d = states.shape[-1]
         if self.linear:
             return np.full((*self.target.shape, d), self.H(d))
         std = None
         if self._differenced:
-            # In place: all groups of the pattern have the same list.
+            # The sensors that still need differences: those without a derivative, and those whose
+            # derivative has not been checked yet. In place, since the groups of all steps in which
+            # the agents have the same sensors share the list.
             remaining = [s for s in self._differenced if needs_differences(s)]
             self._differenced[:] = remaining
             if cov is not None and remaining:

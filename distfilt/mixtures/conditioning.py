@@ -95,12 +95,16 @@ def update_mixture(
 ) -> GaussianMixture:
     """Condition a mixture on an observation: each component, and the weights by its likelihood.
 
-    A component that cannot predict the observation (`function` is NaN at one of its points) is left
-    out.
+    A component's prediction, and its covariance with the state, follow from the values of
+    `function` at the component's mean and at √3 standard deviations on both sides of it along each
+    column of the covariance's Cholesky factor, 2d + 1 points (divided differences of second order).
+    A component that cannot predict the observation (`function` is NaN at one of these points) is
+    left out.
 
     Parameters
     ----------
     mixture : GaussianMixture
+        Of L components.
     observed : ndarray, (m,)
         NaN marks a missing component.
     function : callable
@@ -110,7 +114,9 @@ def update_mixture(
     residual : callable
         ``residual(a, b)``, for observations that wrap.
     on_branch : bool
-        Whether `function` returns the angles of points (L, N, d) on one branch by itself.
+        Whether `function`, given the points of all components (L, 2d + 1, d), returns the angles of
+        one component's points without a jump by a period between them. Then they are compared by
+        plain differences, otherwise by `residual`.
 
     Raises
     ------
@@ -153,6 +159,7 @@ def update_together(
     innovation = _find_innovations(
         mixture, observed, function, noise, residual, on_branch
     )
+    # The columns of a root of S = first firstᵀ + second secondᵀ + R.
     first = innovation.first
     second = innovation.second
     noise_factor = innovation.noise_factor

@@ -275,18 +275,22 @@ class PartialFusion(FrozenModel):
             return _weight_by_values(mixture, np.log(coefficients))
 
     def _log_values_by_source(self, shapes: ComponentShapes) -> Array:
-        """Log of the fused density at the components' means, (S,), for C1, (30) of Semeraro et al.
+        """Log of the fused density at the means of S components, for C1, (30) of Semeraro et al.
 
-        Of the prior's components only the source of each counts, not the sum over all of them.
+        Each component has come from one component q of the prior, its source. C1 takes the weighted
+        density of the source alone in place of the prior's, which is the sum over all components.
         """
         prior = self.prior
+        # Index q of each component's source
         source = shapes.source
-        # log w_q N_q(m) = log w_q + log peak_q - ½ |L_q⁻¹ (m - m_q)|²
+        # log w_q N_q(m) = log w_q + log peak_q - ½ |L_q⁻¹ (m - m_q)|², where N_q has the covariance
+        # L_q L_qᵀ and at its mean m_q the value peak_q
         differences = shapes.means - prior.means[source]
         white = np.linalg.solve(prior.factors[source], differences[..., None])[..., 0]
         log_peaks = (prior.log_weights + prior.log_peaks)[source]
         logs = log_peaks - 0.5 * (white**2).sum(axis=-1)
-        # Times the update factor g(t), a function of the target t alone.
+        # Times g(t), by which the others' beliefs change the prior: a function of the target t
+        # alone, the first components of the state.
         return self._add_log_update(logs, shapes.means[:, : self.target_dim], "shapes")
 
     def _collocate(

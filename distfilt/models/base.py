@@ -216,8 +216,13 @@ class Model(FrozenModel):
         def move(states: Array) -> Array:
             return self.step(states, t, dt)
 
+        # Differences of angles are the shorter way round.
         difference = self._subtract if self.periods else np.subtract
         differences = partial(difference_with_error, move, x, difference, scale=std)
+        # A given derivative comes here the first time only, to be compared with differences. A step
+        # that moves nothing has the derivative I, and compared is what a step adds to it. Errors of
+        # the differences do no harm if they are small beside the deviations of the states, which
+        # are taken for those after the step (`tolerance`) too.
         return evaluate_derivative(
             self,
             (x, t, dt),
@@ -397,8 +402,12 @@ class LinearModel(Model):
         *,
         std: Annotated[ArrayInput, "... self.dim"] | None = None,
     ) -> Array:
-        """Derivative of a step, the same matrix for all states, as (..., d, d)."""
+        """Derivative of a step, the same matrix Φ for all states, as (..., d, d).
+
+        `std`, by which other models choose the length of their differences, changes nothing here.
+        """
         if self.time_invariant:
+            # Φ depends on dt alone: its transpose is kept, with which a step multiplies, x Φᵀ.
             phi = _transpose_transition(self, dt).T
         else:
             phi = self.F(dt, t)

@@ -566,20 +566,24 @@ def _range_bearing_jacobian(
     # A constant heading only shifts the bearing, so that it does not enter.
     offset = _offset(x, indices, origin, observer)
     length = _lengths(offset)
+    # At the sensor's own place there is no bearing: its derivative is NaN.
     positive = _replace_zeros(length, np.nan)
     unit = offset / positive
     slopes = np.empty((*offset.shape[:-1], 2, 2))
-    # As in `_distance_slope` and `_angle_slope`
+    # The distance |v| has the derivative vᵀ / |v|.
     slopes[..., 0, :] = unit
     if positive is not length:
+        # Some length is zero, where the distance's derivative is zero too, and not NaN.
         slopes[..., 0, :] = _distance_slope(offset, length)
+    # The bearing arctan2(b, a) has the derivative (-b, a) / |v|²: by |v| twice, without overflow.
     slopes[..., 1, 0] = -unit[..., 1]
     slopes[..., 1, 1] = unit[..., 0]
     slopes[..., 1, :] /= positive
     jacobian = _insert_columns(slopes, indices, observer, x.shape[-1])
     if len(observer) > len(indices):
+        # Behind its position the sensor's body has a heading: as it turns, the bearing decreases.
         turn = observer[len(indices)]
-        # As in `_angle_jacobian`
+        # Adding 0 · NaN gives NaN where there is no bearing.
         jacobian[..., 1, turn] = -1.0 + 0.0 * slopes[..., 1, 0]
     return jacobian
 

@@ -220,15 +220,22 @@ def _proximal_step(moments: Array, used: Mask) -> Callable[[Array, float], Array
     """Return the proximal step of all agents, the formula of :func:`pool_by_admm`.
 
     The `moments` are the second moments C of (1, y, x), (A, 1 + m + d, 1 + m + d). The step is a
-    function of the targets Z - W and of rho. It works on the used coefficients, one row an agent.
+    function of the targets Z - W and of rho. It works on the used coefficients, one row an agent:
+    those that `used` (d, 1 + m + d) marks, row k for component k of the map.
     """
 
     def solve(target: Array, rho: float) -> Array:
-        """Return the coefficients u (A, n) of the agents for their targets Z - W (A, n)."""
+        """Return the coefficients u (A, n) of the agents for their targets Z - W (A, n).
+
+        For each component k they minimise ½ uᵀ C u - log u_k + ½ rho |u - target|², where u_k is
+        the component's own coefficient, the last that it uses. So (C + rho I) u = b + e_k / u_k
+        with b = rho target and the last unit vector e_k.
+        """
         # Unpacked to (A, d, 1 + m + d): b, which each component's solution replaces.
         coefficients = np.zeros((len(target), *used.shape))
         coefficients[:, used] = rho * target
         for k in range(len(used)):
+            # It uses the first n of (1, y, x).
             n = int(used[k].sum())
             # H b and H e_k of all agents in one solve, H = (C + rho I)⁻¹.
             regular = moments[:, :n, :n] + rho * np.eye(n)
@@ -238,7 +245,8 @@ def _proximal_step(moments: Array, used: Mask) -> Callable[[Array, float], Array
             solution = np.linalg.solve(regular, right)
             hb = solution[..., 0]
             he = solution[..., 1]
-            # u_k = ((H b)_k + sqrt((H b)_k² + 4 H_kk)) / 2, the positive root.
+            # Row k of u = H b + H e_k / u_k is u_k² - (H b)_k u_k - H_kk = 0. Its positive root is
+            # u_k = ((H b)_k + sqrt((H b)_k² + 4 H_kk)) / 2.
             hb_last = hb[:, -1]
             discriminant = hb_last**2 + 4 * he[:, -1]
             last = 0.5 * (hb_last + np.sqrt(discriminant))

@@ -495,13 +495,16 @@ def _draw_rows(
     """Return the method of a distribution that draws for the batch and selects the rows.
 
     `name` and `parameters` are numpy's; `by_row` says whether each row may have its own parameters.
+    The batch has the axes ``self.lead``, and ``self.rows`` (n,) are flat indices into it.
     """
     # numpy's own method, which the new one calls.
     draw = getattr(np.random.Generator, name)
     names = (*parameters, "size", *_OPTIONS.get(name, ()))
 
     def method(self: RowGenerator, *args: Any, **options: Any) -> Any:
-        # All arguments by name, as numpy would bind them.
+        # This generator is asked for numbers of some rows of a batch, (n, ...). It draws for all
+        # rows and selects, so that a row's numbers do not depend on which others are asked for.
+        # First all arguments by name, as numpy would bind them.
         bound = dict(zip(names, args, strict=False)) | options
         size = bound.get("size")
         target = bound.get("out")
@@ -513,10 +516,11 @@ def _draw_rows(
             shape = np.broadcast_shapes(*shapes)
         else:
             shape = tuple(size) if np.iterable(size) else ()
-        # Draws that do not belong to rows are numpy's.
+        # Draws whose first axis is not that of the rows are numpy's.
         if not self._has_rows(shape):
             return draw(self, *args, **options)
         # Draw for all rows of the batch, (*lead, ...), in place of this generator's, (n, ...).
+        # Parameters that the rows have each for themselves get entries for the other rows too.
         for p in parameters:
             if by_row and bound.get(p) is not None:
                 bound[p] = self._extend_parameter(bound[p], len(shape))

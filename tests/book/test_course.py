@@ -21,21 +21,25 @@ def printed(week: int) -> list[float]:
 
 def gaussian_update(prior_var: float, variances: list[float], values: list[float]):
     """Return variance and mean after independent measurements of a scalar."""
+    # 1/P = 1/P₀ + Σ 1/R and m = P Σ y/R, as the prior's mean is zero
     precision = 1 / prior_var + sum(1 / v for v in variances)
-    mean = sum(y / v for y, v in zip(values, variances, strict=True)) / precision
-    return [1 / precision, mean]
+    weighted = [y / v for y, v in zip(values, variances, strict=True)]
+    return [1 / precision, sum(weighted) / precision]
 
 
 def week_1() -> list[float]:
     after_a = gaussian_update(4, [1], [2])
     after_b = gaussian_update(4, [4], [1])
-    return after_a + after_b + gaussian_update(4, [1, 4], [2, 1])
+    after_both = gaussian_update(4, [1, 4], [2, 1])
+    return after_a + after_b + after_both
 
 
 def week_2() -> list[float]:
     points = np.linspace(0, 4, 400_001)
+    # log N(x; 0, 1) + log N(4; x², 1), up to a constant
     log_density = -(points**2) / 2 - (4 - points**2) ** 2 / 2
-    return [0, 1, points[np.argmax(log_density)]]
+    mode = points[np.argmax(log_density)]
+    return [0, 1, mode]
 
 
 def steady_forecast_variance(noise: float) -> float:
@@ -52,6 +56,7 @@ def week_3() -> list[float]:
     gain = reported / (reported + 4)
     actual = 1.0
     for _ in range(500):
+        # (1 - K)² P + K² R + Q, for any gain
         actual = (1 - gain) ** 2 * actual + gain**2 * 2 + 1
     first = [right, right / (right + 2), right + 2]
     second = [reported, gain, reported + 4, actual]
@@ -72,7 +77,10 @@ def week_5() -> list[float]:
 
 def week_6() -> list[float]:
     joint = np.array([[2.0, 1.0], [1.0, 1.0]])
-    return [joint[0, 1] / joint[0, 0], joint[1, 1] - joint[0, 1] ** 2 / joint[0, 0]]
+    # E[y | x] = K x with K = P_xy / P_xx, and var(y | x) = P_yy - P_xy² / P_xx
+    slope = joint[0, 1] / joint[0, 0]
+    conditional_var = joint[1, 1] - joint[0, 1] ** 2 / joint[0, 0]
+    return [slope, conditional_var]
 
 
 def week_7() -> list[float]:

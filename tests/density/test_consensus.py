@@ -76,7 +76,8 @@ def test_losses_on_one_way_links_move_the_average_and_are_warned_of_once() -> No
         _, y, _ = rule.update(
             memory, first, Channel(circle, faults=Faults(loss=loss)), 0.1
         )
-    assert np.allclose(y.sum(axis=0) - u.sum(axis=0), (u[1] - u[0]) / 2, atol=1e-12)
+    moved = y.sum(axis=0) - u.sum(axis=0)
+    assert np.allclose(moved, (u[1] - u[0]) / 2, atol=1e-12)
     with warnings.catch_warnings(action="error"):
         # Once for each rule; and never without losses, or with links both ways.
         rule.update(memory, first, Channel(circle, faults=Faults(loss=loss)), 0.1)

@@ -46,7 +46,8 @@ def test_two_steps_are_the_textbook_kalman_filter(filters: int) -> None:
         covs = phi @ covs @ phi.T + process_cov
         noise = r[:, :, None] * np.eye(n) / dt
         gains = covs @ np.linalg.inv(covs + noise)
-        means = means + np.einsum("fij,fj->fi", gains, y - means)
+        corrections = np.einsum("fij,fj->fi", gains, y - means)
+        means = means + corrections
         covs = covs - gains @ covs
         state = _predict_and_step(state, lambda x: x @ phi.T, y, r, dt, q)
     assert np.allclose(state.estimates, means)

@@ -228,6 +228,8 @@ def test_agents_without_links_do_not_notice_the_others(name: str) -> None:
     a = run(problem, name)
     b = run(replace(problem, paths=mirrored), name)
     for field in ("mean", "variance"):
-        assert np.array_equal(a[field].values[:, 0], b[field].values[:, 0])
+        one = a[field].values
+        other = b[field].values
+        assert np.array_equal(one[:, 0], other[:, 0])
         # They do notice themselves.
-        assert not np.allclose(a[field].values[:, 1], b[field].values[:, 1])
+        assert not np.allclose(one[:, 1], other[:, 1])

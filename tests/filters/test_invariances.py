@@ -61,6 +61,7 @@ def test_a_batch_loses_the_messages_of_its_runs(name: str) -> None:
     if case.prior == "common members":
         pytest.skip("members in common need every message")
     problem = problem_of(case, runs=2)
+    # Both runs have the first one's observations, so that only their losses differ.
     same = [replace(e, value=e.value[[0, 0]]) for e in problem.events]
     faults = Faults(loss=0.4, seed=2)
     batch = record(case, replace(problem, events=same), runs=2, faults=faults)
@@ -299,7 +300,8 @@ def test_a_run_with_late_observations_is_its_steps(name: str) -> None:
     states = []
     before = start.t
     for t in TIMES.tolist():
-        listed = [[e for e in punctual if (e.t, e.agent) == (t, a)] for a in range(4)]
+        now = [e for e in punctual if e.t == t]
+        listed = [[e for e in now if e.agent == agent] for agent in range(4)]
         arrived = [e for e in late if before < e.arrival_time <= t]
         arrived.sort(key=lambda e: e.arrival_time)
         state = f.step(state, t, listed, delayed=arrived)

@@ -124,17 +124,18 @@ def test_a_weight_of_measurements_divides_their_noise(
 def test_equal_values_of_two_agents_both_count() -> None:
     """Also in a step that is asked for its observations twice."""
     still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-    f = filters.GaussianFilter(
-        still, [component([0], std=1.0)] * 2, graphs.path(2), lag=1
-    )
+    team = [component([0], std=1.0)] * 2
+    f = filters.GaussianFilter(still, team, graphs.path(2), lag=1)
     start = f.start(([0.0], [[2.0]]))
     of_both = [[Observation(1.0, 0, [0.5])], [Observation(1.0, 1, [0.5])]]
     state = f.step(start, 1.0, of_both)
     state = f.step(state, 1.0, [[], [Observation(1.0, 1, [0.7])]])
     state = f.step(state, 1.0, [[Observation(1.0, 0, [0.7])], []])
-    # Four observations of both agents, with a variance of 1.
-    assert np.allclose(state.covariances, 1 / (1 / 2 + 4))
-    assert np.allclose(state.means, 2.4 / (1 / 2 + 4))
+    # Four observations of both agents, with a variance of 1: 1/P = 1/P₀ + 4 and m = P Σ y
+    precision = 1 / 2 + 4
+    total = 0.5 + 0.5 + 0.7 + 0.7
+    assert np.allclose(state.covariances, 1 / precision)
+    assert np.allclose(state.means, total / precision)
 
 
 def bend(x: Array) -> Array:
@@ -206,12 +207,9 @@ def test_the_grid_of_a_linear_problem_is_the_kalman_filter(
     options: dict[str, Any],
 ) -> None:
     """Of all observations, whether they are sent or their likelihoods are averaged."""
-    cross = Sensor(
-        2,
-        lambda x: x @ np.array([[1.0, 0.5], [0.0, 2.0]]).T,
-        [[0.5, 0.3], [0.3, 0.9]],
-        linear=lambda d: np.array([[1.0, 0.5], [0.0, 2.0]]),
-    )
+    h = np.array([[1.0, 0.5], [0.0, 2.0]])
+    r = [[0.5, 0.3], [0.3, 0.9]]
+    cross = Sensor(2, lambda x: x @ h.T, r, linear=lambda d: h)
     team = [cross, component([1], std=0.7), None]
     times = [0.4, 0.9, 1.3]
     series: list[Any] = [
@@ -276,7 +274,8 @@ def test_each_run_measures_changes_from_its_last_observation(name: str) -> None:
     for t in TIMES:
         for agent, number, size in ((0, 0, 2), (1, 0, 1), (1, 1, 1), (3, 0, 1)):
             value = 0.3 * rng.standard_normal((2, size))
-            value[rng.random(value.shape) < 0.4] = np.nan
+            is_missing = rng.random(value.shape) < 0.4
+            value[is_missing] = np.nan
             events.append(Observation(t, agent, value, number))
     f = FAMILIES[name](problem.model, team, problem.graph)
     prior = list(problem.members[:, : f.members])
@@ -287,7 +286,8 @@ def test_each_run_measures_changes_from_its_last_observation(name: str) -> None:
 
     batch = run(events, (2,))
     for k in range(2):
-        single = run([replace(e, value=e.value[k]) for e in events], ())
+        of_run = [replace(e, value=e.value[k]) for e in events]
+        single = run(of_run, ())
         assert_equal(batch.isel(run=k), single)
 
 
@@ -310,9 +310,8 @@ def test_noise_of_equal_variances_is_still_each_agent_s_own(name: str) -> None:
     """Sensors that differ in the sign of a correlation alone, with and without a missing number."""
     d = 2 if name == "grid" else 3
     problem = make_problem(d, noise=d == 2)
-    team = [
-        Sensor(2, lambda x: x[..., :2], [[0.5, c], [c, 0.4]]) for c in (0.3, -0.3, 0.0)
-    ]
+    noises = [[[0.5, c], [c, 0.4]] for c in (0.3, -0.3, 0.0)]
+    team = [Sensor(2, lambda x: x[..., :2], noise) for noise in noises]
     y = np.array([[0.3, 1.5], [0.4, -1.0], [1.1, 0.2]])
     series = [np.stack([y[k], [0.7, np.nan]]) for k in range(3)]
     f = UNLIKE[name](problem.model, team, share_observations=False)
@@ -326,7 +325,8 @@ def test_noise_of_equal_variances_is_still_each_agent_s_own(name: str) -> None:
 
     together = run(f, series)
     for k in range(3):
-        single = run(UNLIKE[name](problem.model, [team[k]]), [series[k]])
+        alone = UNLIKE[name](problem.model, [team[k]])
+        single = run(alone, [series[k]])
         assert_equal(together.isel(agent=[k]), single)
     assert not np.allclose(together["mean"][0, 0], together["mean"][0, 1])
 
@@ -442,7 +442,10 @@ def test_a_reset_forgets_the_rejections_of_its_agents_alone() -> None:
     state = f.start(([0.0], [[1.0]]), runs=(2,))
     for t in (1.0, 2.0):
         # The first agent's observation is far off in the first run, the others' in both.
-        state = f.step(state, t, [[[50.0 + t], [0.0]], *[[[50.0 + t]] * 2] * 2])
+        far = [50.0 + t]
+        of_first = [far, [0.0]]
+        of_others = [far, far]
+        state = f.step(state, t, [of_first, of_others, of_others])
     before = state.rejection_streaks
     assert before is not None
     assert before.sum(axis=(-2, -1)).tolist() == [[2.0, 2.0, 2.0], [0.0, 2.0, 2.0]]
@@ -459,14 +462,16 @@ def test_scores_of_a_late_and_a_present_observation_add_up(make: Any) -> None:
     prior: Any = ([0.0], [[2.0]])
     if make == "ensemble":
         make = partial(filters.EnsembleFilter.exact, members=20)
-        # Members with the variance 2 of the prior
-        prior = np.repeat([-1.0, 1.0], 10)[:, None] * np.sqrt(2 * 19 / 20)
+        # Ten members at each of ±a have the sample variance 20 a² / 19, here the prior's 2.
+        a = np.sqrt(2 * 19 / 20)
+        prior = np.repeat([-a, a], 10)[:, None]
     late = Observation(1.0, 0, [-0.4])
 
     def step(y: float, delayed: Observation, **options: Any) -> Any:
         f = make(still, team, lag=1, **options)
         start = f.start(prior, rng=np.random.default_rng(0))
-        return f.step(f.step(start, 1.0, [None]), 2.0, [[y]], delayed=[delayed])
+        before = f.step(start, 1.0, [None])
+        return f.step(before, 2.0, [[y]], delayed=[delayed])
 
     state = step(1.3, late, record_evidence=True)
     # One state of variance 2 at rest, observed twice with independent errors of variance 0.25
@@ -474,12 +479,16 @@ def test_scores_of_a_late_and_a_present_observation_add_up(make: Any) -> None:
     values = np.array([-0.4, 1.3])
     expected = multivariate_normal(np.zeros(2), joint).logpdf(values)
     assert np.allclose(state.log_likelihood, expected)
-    assert np.allclose(state.nis, values @ np.linalg.solve(joint, values))
+    # yᵀ S⁻¹ y, as the predicted mean is zero
+    nis = values @ np.linalg.solve(joint, values)
+    assert np.allclose(state.nis, nis)
     assert np.array_equal(state.n_observed, [2])
     # Rejected are the late one and the present one, or the late one alone.
     far = replace(late, value=np.array([60.0]))
-    assert np.array_equal(step(50.0, far, gate_probability=0.99).rejected, [2.0])
-    assert np.array_equal(step(0.1, far, gate_probability=0.99).rejected, [1.0])
+    both_far = step(50.0, far, gate_probability=0.99)
+    assert np.array_equal(both_far.rejected, [2.0])
+    late_far = step(0.1, far, gate_probability=0.99)
+    assert np.array_equal(late_far.rejected, [1.0])
 
 
 @pytest.mark.filterwarnings("ignore:observations must be predicted to be used")
@@ -503,7 +512,8 @@ def test_unseen_observations_of_a_step_add_up_and_belong_to_it(make: Any) -> Non
     late = [Observation(1.0, 0, [-0.4], arrival_time=2.0)]
     for call in (f.run, f.smooth):
         record_ = call(start, [1.0, 2.0, 3.0], present, delayed=late)
-        assert record_["unseen"].values[:, 0].tolist() == [0.0, 2.0, 0.0]
+        unseen = record_["unseen"].values[:, 0]
+        assert unseen.tolist() == [0.0, 2.0, 0.0]
 
 
 @pytest.mark.parametrize(
@@ -520,7 +530,8 @@ def test_a_compass_as_a_density_is_tested_the_shorter_way_round(make: Any) -> No
     plain = Sensor(1, lambda x: x, [[0.04]], periods=turn)
 
     def log_likelihood(x: Array, y: Array) -> Array:
-        return norm.logpdf(wrap(y - x)[..., 0], scale=0.2)
+        residual = wrap(y - x)
+        return norm.logpdf(residual[..., 0], scale=0.2)
 
     def moments(x: Array) -> tuple[Array, Array]:
         return x, np.full((*x.shape, 1), 0.04)
@@ -535,7 +546,8 @@ def test_a_compass_as_a_density_is_tested_the_shorter_way_round(make: Any) -> No
         seen = [[-3.1], [3.1 - np.pi], [3.0]]
         runs.append(f.run(start, [1.0, 2.0, 3.0], [seen]))
     a, b = runs
-    assert a["rejected"].values.ravel().tolist() == [0.0, 1.0, 0.0]
+    rejected = a["rejected"].values.ravel()
+    assert rejected.tolist() == [0.0, 1.0, 0.0]
     assert_equal(a, b, ("mean", "variance", "rejected", "n_observed"))
     # The variance of 20 members of equal weights is divided by 19 or by 20.
     assert np.allclose(a["nis"], b["nis"], rtol=1 / 19)
@@ -549,11 +561,13 @@ def test_an_innovation_is_the_shorter_way_to_the_mean(side: float) -> None:
     compass = Sensor(1, lambda x: x, [[0.04]], periods=turn)
     f = filters.ParticleFilter(rest, [compass], members=50, record_evidence=True)
     # The first member, beside which the others are put, is on one side of the mean or the other.
-    members = 1.0 + np.sign(side) * np.linspace(0.3, -0.3, 50)[:, None]
-    start = f.start(members, rng=np.random.default_rng(0))
+    members = 1.0 + np.sign(side) * np.linspace(0.3, -0.3, 50)
+    start = f.start(members[:, None], rng=np.random.default_rng(0))
     before = f.summarize(start)
     y = before.mean[0, 0] + np.pi + side
     with warnings.catch_warnings(action="ignore"):
         state = f.step(start, 0.0, [[y]])
-    expected = (np.pi - 0.1) ** 2 / (before.variance[0, 0] + 0.04)
+    # r² / S with r = π - 0.1 and S = P + R
+    innovation_var = before.variance[0, 0] + 0.04
+    expected = (np.pi - 0.1) ** 2 / innovation_var
     assert np.isclose(state.nis[0], expected, rtol=1e-9)

@@ -234,9 +234,11 @@ def test_the_gate_lets_pass_what_its_share_says(family: str) -> None:
     s = cov + 0.36 * np.eye(2)
     one_number = np.array([np.nan, np.nan])
     one_number[0] = np.sqrt(chi2.ppf(0.95, 1) * s[0, 0])
+    # c u has the distance c² uᵀ S⁻¹ u.
     direction = np.array([1.0, -1.0])
     squared = direction @ np.linalg.solve(s, direction)
-    both = np.sqrt(chi2.ppf(0.95, 2) / squared) * direction
+    length = np.sqrt(chi2.ppf(0.95, 2) / squared)
+    both = length * direction
     for edge in (one_number, both):
         for factor, refused in ((0.999, 0), (1.001, 1)):
             y = mean + factor * edge
@@ -281,6 +283,7 @@ def test_each_reading_is_judged_alone() -> None:
     f = filters.GaussianFilter(
         still_model(1), [bowl], linearization="unscented", gate_probability=0.95
     )
+    # S = 1 + R with R = 0.5
     edge = np.sqrt(1.5 * chi2.ppf(0.95, 1))
     start = f.start((np.zeros(1), np.eye(1)))
     assert f.start(norm(1.0, 3.0)).covariances[0, 0, 0] == 9.0

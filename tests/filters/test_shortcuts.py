@@ -178,7 +178,8 @@ def test_the_record_counts_each_step(has_graph: bool) -> None:
         graph,
         share_observations=has_graph,
     )
-    run = f.run(f.start(PRIOR), [1.0, 2.0, 3.0], [np.ones((3, 1)), np.ones((3, 1))])
+    series = np.ones((3, 1))
+    run = f.run(f.start(PRIOR), [1.0, 2.0, 3.0], [series, series])
     assert run["messages"].values.tolist() == [[has_graph] * 2] * 3
     expected = [[k * has_graph] * 2 for k in (1, 2, 3)]
     assert run["scalars_total"].values.tolist() == expected

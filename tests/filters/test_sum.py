@@ -78,7 +78,8 @@ def test_a_split_of_some_components_keeps_full_moments(axes: Any) -> None:
     gain = cross @ np.linalg.inv(cov[np.ix_(first, first)])
     piece = split.covs[0]
     inner = np.linalg.inv(piece[np.ix_(first, first)])
-    assert np.allclose(piece[np.ix_(rest, first)] @ inner, gain)
+    gain_of_piece = piece[np.ix_(rest, first)] @ inner
+    assert np.allclose(gain_of_piece, gain)
 
 
 def test_what_a_split_refuses() -> None:
@@ -148,8 +149,10 @@ def test_the_evidence_is_the_density_of_the_mixture() -> None:
     densities = norm(prior.means[:, 0], std).pdf(0.7)
     density = (prior.weights * densities).sum()
     assert np.allclose(state.log_likelihood, np.log(density))
+    # r² / S with the moments of the whole mixture
     mean, cov = prior.moments()
-    expected_nis = (0.7 - mean) ** 2 / (cov[0, 0] + 0.25)
+    innovation_var = cov[0, 0] + 0.25
+    expected_nis = (0.7 - mean) ** 2 / innovation_var
     assert np.allclose(state.nis, expected_nis)
 
 

@@ -88,7 +88,8 @@ def test_all_agents_become_the_central_filter(tree: Graph) -> None:
     """After as many quiet steps as the diameter, to rounding."""
     seen = observations()
     mean, cov = central(seen, tree.diameter)
-    state = run(ChannelFilter(rotation(), sensors(), tree), seen, tree.diameter)
+    f = ChannelFilter(rotation(), sensors(), tree)
+    state = run(f, seen, tree.diameter)
     assert np.allclose(state.means, mean, rtol=0, atol=1e-12)
     assert np.allclose(state.covariances, cov, rtol=0, atol=1e-12)
     # Both ends of a link know the same.
@@ -201,8 +202,10 @@ def test_a_reset_is_common_knowledge() -> None:
         vector = vector + weighted @ y
     for k, entries in enumerate([seen, *[[None] * 5] * 4]):
         state = f.step(state, 3.0 + k, entries)
-    assert np.allclose(state.means, np.linalg.solve(matrix, vector), atol=1e-10)
-    assert np.allclose(state.covariances, np.linalg.inv(matrix), atol=1e-10)
+    mean = np.linalg.solve(matrix, vector)
+    cov = np.linalg.inv(matrix)
+    assert np.allclose(state.means, mean, atol=1e-10)
+    assert np.allclose(state.covariances, cov, atol=1e-10)
 
 
 @pytest.mark.parametrize(

@@ -235,7 +235,12 @@ def test_degrees_are_told_and_what_cannot_be_seen_is_named(run: Any) -> None:
         RuntimeWarning, match="must be angles in rad, got some 7 turns off"
     ):
         run(*prior, [[45.3]], model=still, sensors=[compass], times=[1.0])
-    near = Sensor(1, lambda x: np.where(x[..., :1] < 5, x[..., :1], np.nan), [[0.1]])
+
+    def see_near(x: np.ndarray) -> np.ndarray:
+        first = x[..., :1]
+        return np.where(first < 5, first, np.nan)
+
+    near = Sensor(1, see_near, [[0.1]])
     with pytest.raises(ValueError, match="but a sensor cannot see at t = 1 s"):
         run(*prior, [[4.0]], model=still, sensors=[near], times=[1.0])
     # Of two sensors the other one is enough, if nothing comes from the blind one.
@@ -246,4 +251,6 @@ def test_degrees_are_told_and_what_cannot_be_seen_is_named(run: Any) -> None:
         sensors=[near, component([0], std=0.1)],
         times=[1.0],
     )
-    assert np.isclose(both.means[0, 0], 10 + 0.5 * 0.1 / 0.11)
+    # K = P / (P + R) with P = 0.1 and R = 0.1², and an innovation of 0.5
+    gain = 0.1 / 0.11
+    assert np.isclose(both.means[0, 0], 10 + 0.5 * gain)

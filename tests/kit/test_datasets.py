@@ -63,7 +63,8 @@ def test_a_set_of_utias_by_hand(tmp_path: Path) -> None:
     assert data.landmarks.loc["6"].tolist() == [3.0, 4.0]
     # The heading goes on through π; between poses it is interpolated.
     poses = data.true_poses(np.array([0.5, 1.0, 2.5]))
-    assert np.allclose(poses[0, 0], [0.25, 0.0, (3.1 + 2 * np.pi - 3.1) / 2])
+    halfway = (3.1 + 2 * np.pi - 3.1) / 2
+    assert np.allclose(poses[0, 0], [0.25, 0.0, halfway])
     assert np.isnan(poses[2]).all()
     assert np.allclose(data.true_state(1.0), poses[1, 0])
 

@@ -51,6 +51,7 @@ def test_sensors_predict_the_geometry() -> None:
     # B looks backwards along the first axis, and has the other robot straight ahead.
     assert np.allclose(sensors["B", "A"].predict(state), [4.0, 0.0])
     ranges = datasets.make_sensors(data, "range", 0.3, anchors=LANDMARKS)
+    # From B at (4, 0) to L1 at (2, -1), and between the robots
     assert np.allclose(ranges["B", "L1"].predict(state[:6]), np.sqrt(5))
     assert np.allclose(ranges["A", "B"].predict(state[:6]), 4.0)
     with pytest.raises(ValueError, match="kind must be range or range_bearing"):
@@ -87,16 +88,17 @@ def test_errors_by_hand() -> None:
     means[:, 5] += 2 * np.pi + 0.2
     covs = np.tile(np.diag([0.09, 0.16, 1, 1, 1, 0.04]), (2, 1, 1))
     errors = datasets.score_poses(data, np.array([1.0, 9.0]), means, covs)
+    # 0.3² + 0.4² and 0.2², as means over two robots; the NEES 0.3²/0.09 + 0.4²/0.16 + 0.2²/0.04
+    # by its six components
     assert np.allclose(errors.loc[1.0], [0.25 / 2, 0.04 / 2, 3 / 6])
     # Behind the end of the truth
     assert errors.loc[9.0].isna().all()
     # With agents in between: the mean over them
-    both = datasets.score_poses(
-        data,
-        np.array([1.0]),
-        np.stack([means[:1], np.tile(data.true_state(0.0), (1, 1))], axis=1),
-        np.stack([covs[:1], covs[:1]], axis=1),
-    )
+    right = np.tile(data.true_state(0.0), (1, 1))
+    means_of_both = np.stack([means[:1], right], axis=1)
+    covs_of_both = np.stack([covs[:1], covs[:1]], axis=1)
+    both = datasets.score_poses(data, np.array([1.0]), means_of_both, covs_of_both)
+    # The second agent errs in nothing.
     assert np.allclose(both.loc[1.0], [0.25 / 4, 0.04 / 4, 3 / 12])
     # A gap of one robot leaves the other's error.
     gap = replace(data, truth=TRUTH[TRUTH["robot"] == "B"])
@@ -109,6 +111,7 @@ def test_errors_of_landmarks_by_hand() -> None:
     mean = np.append(data.true_state(0.0), [3.0, 4.5, 2.0, -1.0])
     cov = np.diag([1.0] * 6 + [1.0, 0.25, 1.0, 1.0])
     errors = datasets.score_landmarks(data, mean, cov)
+    # L0 is off by 0.5 m in its second coordinate: 0.5², and 0.5²/0.25 by two components.
     assert errors["place"].to_dict() == {"L0": 0.25, "L1": 0.0}
     assert errors["place_nees"].to_dict() == {"L0": 0.5, "L1": 0.0}
 

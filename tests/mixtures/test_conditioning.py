@@ -104,9 +104,11 @@ def test_steps_do_not_depend_on_coordinates_or_order() -> None:
     p = GaussianMixture.construct(
         p.weights, p.means, p.covs, factors=matrix @ P.factors
     )
-    forecast = propagate_mixture(
-        p, lambda x: move(to_original(x)) @ matrix.T + shift, 0.1 * matrix
-    )
+
+    def move_in_frame(x: np.ndarray) -> np.ndarray:
+        return move(to_original(x)) @ matrix.T + shift
+
+    forecast = propagate_mixture(p, move_in_frame, 0.1 * matrix)
     forecast = transform(forecast, inverse, inverse_shift)
     expected = propagate_mixture(P, move, 0.1 * np.eye(3))
     assert_same(forecast, expected, 1e-8)
@@ -125,7 +127,8 @@ def test_a_missing_component_has_no_influence() -> None:
     y = np.array([np.nan, 1.0])
     part = update_mixture(P, y, lambda x: x @ H.T, noise)
     # The marginal noise of the observed component is its block of R.
-    expected = update_mixture(P, np.ones(1), lambda x: x @ H[1:].T, noise[1:, 1:])
+    h = H[1:]
+    expected = update_mixture(P, np.ones(1), lambda x: x @ h.T, noise[1:, 1:])
     assert_same(part, expected)
     nothing = np.full(2, np.nan)
     assert update_mixture(P, nothing, lambda x: x @ H.T, noise) is P

@@ -360,7 +360,8 @@ def test_average_keeps_the_conditional_and_averages_the_target() -> None:
     assert np.allclose(target, np.logaddexp(first, second), rtol=1e-10)
     # p(e | t) is the prior's.
     given_t = prior.log_density(x) - prior_target
-    assert np.allclose(mixed.log_density(x) - target, given_t, rtol=1e-9)
+    mixed_given_t = mixed.log_density(x) - target
+    assert np.allclose(mixed_given_t, given_t, rtol=1e-9)
     several = random_mixture(3, 4, 42)
     mixed = average_mixtures(several, other)
     # A received component is shared by the prior's in proportion to their densities at
@@ -376,14 +377,17 @@ def test_average_keeps_the_conditional_and_averages_the_target() -> None:
     for b, k in np.ndindex(3, 3):
         mean, cov = next(pairs)
         p = several.covs[k]
+        # G = P_et P_tt⁻¹, and the noise has the covariance P_ee - G P_te.
         gain = p[2:, :2] @ np.linalg.inv(p[:2, :2])
-        shift = other.means[b] - several.means[k, :2]
-        assert np.allclose(mean[:2], other.means[b])
-        assert np.allclose(mean[2:], several.means[k, 2:] + gain @ shift)
         residual_cov = p[2:, 2:] - gain @ p[:2, 2:]
-        ego_cov = residual_cov + gain @ other.covs[b] @ gain.T
+        shift = other.means[b] - several.means[k, :2]
+        ego_mean = several.means[k, 2:] + gain @ shift
+        assert np.allclose(mean[:2], other.means[b])
+        assert np.allclose(mean[2:], ego_mean)
+        cross_cov = gain @ other.covs[b]
+        ego_cov = residual_cov + cross_cov @ gain.T
         assert np.allclose(cov[2:, 2:], ego_cov)
-        assert np.allclose(cov[2:, :2], gain @ other.covs[b])
+        assert np.allclose(cov[2:, :2], cross_cov)
     matrix, shift = random_frame(4, target_dim=2)
     received = transform(other, matrix[:2, :2], shift[:2])
     transformed = average_mixtures(transform(several, matrix, shift), received)

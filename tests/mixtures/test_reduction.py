@@ -51,7 +51,7 @@ def merge_by_brute_force(p: GaussianMixture, size: int) -> GaussianMixture:
     c = list(p.covs)
 
     def merge(i: int, j: int) -> tuple[float, np.ndarray, np.ndarray]:
-        # Weight, mean and covariance of both are kept.
+        # Weight, mean and covariance of both are kept: P = Σ w_k (P_k + (m_k - m)(m_k - m)ᵀ) / w.
         total = w[i] + w[j]
         weighted_sum = w[i] * m[i] + w[j] * m[j]
         mean = weighted_sum / total
@@ -99,7 +99,10 @@ def test_a_merger_may_be_the_new_nearest_of_another_component() -> None:
     angles = rng.random(8) * np.pi
     c = np.cos(angles)
     s = np.sin(angles)
-    rotations = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    first_rows = np.stack([c, -s], axis=-1)
+    second_rows = np.stack([s, c], axis=-1)
+    rotations = np.stack([first_rows, second_rows], axis=-2)
+    # Variances along the rotated axes: 1, and between 1e-4 and 1
     lengths = np.zeros((8, 2, 2))
     lengths[:, 0, 0] = 1.0
     lengths[:, 1, 1] = 10.0 ** rng.uniform(-4, 0, 8)

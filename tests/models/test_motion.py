@@ -48,7 +48,6 @@ def test_an_interval_is_divided_into_the_fewest_steps(
     assert len(times) == 4 * steps
     assert np.allclose(times[::4], 3.0 + h * np.arange(steps))
     # Each step multiplies by the series of exp(-h) to the fourth order.
-    # exp(-h) up to the fourth order
     factor = 1 - h + h**2 / 2 - h**3 / 6 + h**4 / 24
     assert np.allclose(result, factor**steps, rtol=1e-14)
 

@@ -25,7 +25,9 @@ def test_parts_of_a_step_lead_to_the_same_pose() -> None:
     x = rng.standard_normal((5, 8))
     u = rng.standard_normal(6)
     whole = drive_poses(x, u, 1.5)
-    parts = drive_poses(drive_poses(drive_poses(x, u, 0.2), u, 1.0), u, 0.3)
+    parts = x
+    for length in (0.2, 1.0, 0.3):
+        parts = drive_poses(parts, u, length)
     assert np.allclose(whole, parts, atol=1e-12)
     assert np.array_equal(whole[:, 6:], x[:, 6:])
     # Rigid motion commutes with a turn of the whole plane.
@@ -33,11 +35,14 @@ def test_parts_of_a_step_lead_to_the_same_pose() -> None:
     turn = np.array([[c, -s], [s, c]])
     turned = x.copy()
     for k in (0, 3):
-        turned[:, k : k + 2] = x[:, k : k + 2] @ turn.T
+        place = slice(k, k + 2)
+        turned[:, place] = x[:, place] @ turn.T
         turned[:, k + 2] += 0.7
     moved = drive_poses(turned, u, 1.5)
     for k in (0, 3):
-        assert np.allclose(moved[:, k : k + 2], whole[:, k : k + 2] @ turn.T)
+        place = slice(k, k + 2)
+        expected = whole[:, place] @ turn.T
+        assert np.allclose(moved[:, place], expected)
 
 
 def test_the_noise_is_that_of_draws() -> None:

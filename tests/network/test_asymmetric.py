@@ -51,8 +51,10 @@ def sources_of(agent: int, arrived: Array) -> list[int]:
 def information_sum(means: Array, covs: Array, weights: Array) -> tuple[Array, Array]:
     """Return P = (Σ ω_j P_j⁻¹)⁻¹ and m = P Σ ω_j P_j⁻¹ m_j."""
     precisions = weights[:, None, None] * np.linalg.inv(covs)
+    vectors = (precisions @ means[..., None])[..., 0]
     cov = np.linalg.inv(precisions.sum(axis=0))
-    return cov @ (precisions @ means[..., None]).sum(axis=0)[:, 0], cov
+    mean = cov @ vectors.sum(axis=0)
+    return mean, cov
 
 
 def shares(sizes: Array) -> Array:
@@ -79,9 +81,10 @@ def add(means: Array, covs: Array) -> tuple[Array, Array]:
 
 
 def average(means: Array, covs: Array) -> tuple[Array, Array]:
-    # The moments of a mixture with equal weights
+    # The moments of a mixture with equal weights: P is the mean of P_j + (m_j - m)(m_j - m)ᵀ
     mean = means.mean(axis=0)
-    return mean, covs.mean(axis=0) + np.cov(means.T, bias=True)
+    spread = np.cov(means.T, bias=True)
+    return mean, covs.mean(axis=0) + spread
 
 
 RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
@@ -389,7 +392,8 @@ def test_bursts_are_as_long_as_they_are_told() -> None:
     lost = faults.draw_rounds(pair, range(20_000), 4)[:, :, 0]
     # A burst begins where a loss follows a message that arrived.
     begins = np.diff(lost.astype(int), axis=0) == 1
-    assert abs(lost.sum() / begins.sum() - 5.0) < 0.2
+    mean_length = lost.sum() / begins.sum()
+    assert abs(mean_length - 5.0) < 0.2
     assert abs(lost.mean() - 0.4) < 0.02
 
 
@@ -464,8 +468,9 @@ def test_fusion_on_a_tree_creates_no_information() -> None:
                 precision = np.linalg.inv(p)
                 information_vector = (precision @ m[..., None])[..., 0]
                 parts.append(information_vector if vector else precision)
+            of_agents, of_links = parts
             # Each undirected link has two entries.
-            result.append(parts[0].sum(axis=1) - 0.5 * parts[1].sum(axis=1))
+            result.append(of_agents.sum(axis=1) - 0.5 * of_links.sum(axis=1))
         return result
 
     before = totals(belief, link)
@@ -502,7 +507,8 @@ def test_beliefs_on_a_tree_are_marginals_of_couplings_that_are_not_symmetric() -
     expected = (cov @ vectors.ravel()).reshape(5, d)
     solve = network.gaussian_belief_propagation
     means, covs = solve(diagonal, vectors, couplings, Channel(TREE))
-    blocks = cov.reshape(5, d, 5, d)[np.arange(5), :, np.arange(5)]
+    own = np.arange(5)
+    blocks = cov.reshape(5, d, 5, d)[own, :, own]
     assert np.allclose(means, expected, atol=1e-12)
     assert np.allclose(covs, blocks, atol=1e-12)
     # A lost message leaves the one before, so that many rounds are exact all the same.
@@ -534,11 +540,11 @@ def test_substeps_of_the_estimator_by_hand() -> None:
     h = dt / n
     for k in range(n):
         now = u + k * h * rate
-        change = h * (
-            alpha * (now - nu) + rate - a * laplacian @ nu + b * laplacian @ eta
-        )
+        following = alpha * (now - nu) + rate
+        agreeing = b * laplacian @ eta - a * laplacian @ nu
+        # Both states are those from before the substep.
         eta = eta - h * b * laplacian @ nu
-        nu = nu + change
+        nu = nu + h * (following + agreeing)
     assert np.allclose(new.estimate, nu, atol=1e-12)
     assert np.allclose(new.integral, eta, atol=1e-12)
 

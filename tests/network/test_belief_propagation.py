@@ -43,10 +43,11 @@ def system(
     # J_ii of agents, and J_ij in the order of the links
     blocks = joint.reshape(n, d, n, d)
     matrices = np.array([blocks[k, :, k] for k in range(n)])
-    couplings = np.array(
-        [blocks[i, :, j] for i, j in zip(graph.receivers, graph.senders, strict=True)]
-    ).reshape(-1, d, d)
-    return matrices, draw.standard_normal((n, d)), couplings, joint
+    links = zip(graph.receivers, graph.senders, strict=True)
+    couplings = np.array([blocks[i, :, j] for i, j in links])
+    vectors = draw.standard_normal((n, d))
+    # Without links too there are three axes.
+    return matrices, vectors, couplings.reshape(-1, d, d), joint
 
 
 @each_tree

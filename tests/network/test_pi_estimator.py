@@ -68,8 +68,10 @@ def test_a_step_of_substeps_by_its_equations(with_rate: bool) -> None:
 @pytest.mark.parametrize(
     ("graph", "dt", "gains", "limit"),
     [
+        # λ = 2 · 99, and then 2 · 1
         (graphs.complete(100), 9.9, (0.2, 0.4, 0.04), 2 / (0.2 + 0.4 * 198)),
         (graphs.path(2), 5.0, (0.3, 0.1, 0.14), 2 / (0.3 + 0.1 * 2)),
+        # The shorter of both: of 2 / 0.5 = 4 and 0.5 / 0.28² = 6.4 above, of 4 and 3.1 here
         (graphs.path(2), 5.0, (0.3, 0.1, 0.2), (0.3 + 0.1 * 2) / (0.2 * 2) ** 2),
         (graphs.path(2), 1e-6, (0.3, 0.1, 0.2), 1.0),
     ],

@@ -106,14 +106,18 @@ def plain_ekf(agent: int) -> tuple[np.ndarray, np.ndarray]:
     now = 0.0
     for k, t in enumerate(TIMES):
         # The step is cut where an input begins.
-        edges = [now, *[s for s in log.times.tolist() if now < s < t], t]
+        changes = [s for s in log.times.tolist() if now < s < t]
+        edges = [now, *changes, t]
         for a, b in zip(edges[:-1], edges[1:], strict=True):
-            u = log.values[np.flatnonzero(log.times <= a)[-1]]
+            # The input that began last
+            row = np.flatnonzero(log.times <= a)[-1]
+            u = log.values[row]
+            v = u[0]
             dt = b - a
             c = np.cos(m[2])
             s = np.sin(m[2])
             # F = ∂x'/∂x and G = ∂x'/∂u of x' = x + dt (v cos θ, v sin θ, ω) with u = (v, ω)
-            f = np.array([[1, 0, -dt * u[0] * s], [0, 1, dt * u[0] * c], [0, 0, 1]])
+            f = np.array([[1, 0, -dt * v * s], [0, 1, dt * v * c], [0, 0, 1]])
             g = np.array([[dt * c, 0], [dt * s, 0], [0, dt]])
             p = f @ p @ f.T + g @ log.cov @ g.T
             m = drive(m, u, dt)
@@ -133,7 +137,9 @@ def plain_ekf(agent: int) -> tuple[np.ndarray, np.ndarray]:
             noise = 0.04 * np.eye(len(rows))
         else:
             continue
-        gain = np.linalg.solve(h @ p @ h.T + noise, h @ p).T
+        # K = P Hᵀ S⁻¹ with S = H P Hᵀ + R
+        innovation_cov = h @ p @ h.T + noise
+        gain = np.linalg.solve(innovation_cov, h @ p).T
         m = m + gain @ innovation
         p = p - gain @ h @ p
     return m, p
@@ -185,8 +191,9 @@ def test_a_team_is_its_robots_one_by_one_for_each_run(option: str, logs: str) ->
         start = single.start(PRIORS[agent], runs=(2,))
         expected = single.run(start, TIMES, observed, delayed=late)
         for name in ("mean", "covariance"):
-            values = run[name].isel(agent=agent).values
-            assert np.allclose(values, expected[name].values[:, :, 0], atol=1e-10)
+            in_team = run[name].isel(agent=agent).values
+            by_itself = expected[name].values[:, :, 0]
+            assert np.allclose(in_team, by_itself, atol=1e-10)
 
 
 @pytest.mark.parametrize("runs", [(), (2,)])
@@ -242,7 +249,9 @@ def test_members_of_a_team_have_the_moments_of_its_robots_alone(family: str) -> 
     seen = [s and s.observe(x, rng=rng) for s, x in zip(sensors, paths, strict=True)]
     team = make(TEAM, sensors, share_observations=False, lag=2)
     start = team.start(PRIORS, rng=np.random.default_rng(0), runs=(2,))
-    late = Observation(1.1, 1, (paths[1][0] + paths[1][1])[:2] / 2, arrival_time=3.0)
+    # Between the robot's places at the first two times
+    halfway = (paths[1][0] + paths[1][1]) / 2
+    late = Observation(1.1, 1, halfway[:2], arrival_time=3.0)
     run = team.run(start, TIMES, seen, delayed=[late])
     for agent in range(3):
         # Other draws, so that both differ by the errors of 8000 members.
@@ -251,7 +260,8 @@ def test_members_of_a_team_have_the_moments_of_its_robots_alone(family: str) -> 
         start = single.start(PRIORS[agent], rng=np.random.default_rng(9))
         expected = single.run(start, TIMES, [seen[agent]], delayed=delayed)
         std = np.sqrt(expected["variance"].values[-1, 0])
-        error = run["mean"].values[-1, :, agent] - expected["mean"].values[-1, 0]
+        mean = run["mean"].values[-1, :, agent]
+        error = mean - expected["mean"].values[-1, 0]
         assert np.abs(error / std).max() < 0.1
         variance = run["variance"].values[-1, :, agent]
         assert np.allclose(variance, std**2, rtol=0.1)

@@ -161,16 +161,20 @@ def test_a_vague_heading(family: str, kind: str, std: float) -> None:
         more["linear"] = lambda d: np.eye(d)[2:]
     elif kind == "residual":
         more = {"residual_function": lambda a, b: wrap(a - b)}
-    sensor = Sensor(
-        1, lambda x: wrap(x[..., 2:]) if kind == "cut" else x[..., 2:], [[0.01]], **more
-    )
+
+    def point(x: np.ndarray) -> np.ndarray:
+        heading = x[..., 2:]
+        return wrap(heading) if kind == "cut" else heading
+
+    sensor = Sensor(1, point, [[0.01]], **more)
     model = still(3, periods=() if kind == "residual" else {2: TURN})
     on_circle = family in ("particle", "transport", "coupling")
     if kind == "residual" and on_circle and std > 1:
         pytest.skip("without a declared period such members are whole turns apart")
     f = FAMILIES[family](model, [sensor])
     state = start(f, np.zeros(3), np.diag([1.0, 1.0, std**2]))
-    summary = f.summarize(quietly(f.step, state, 0.0, [[1.5]]))
+    after = quietly(f.step, state, 0.0, [[1.5]])
+    summary = f.summarize(after)
     # The scalar Kalman filter on the line: m = K y and P = K R with K = P₀ / (P₀ + R)
     gain = std**2 / (std**2 + 0.01)
     expected_std = np.sqrt(gain * 0.01)
@@ -263,17 +267,19 @@ def test_a_transition_that_wraps_is_one_that_runs_on(family: str, cut: bool) -> 
         quietly(f.run, state, times, [wrap(truth + noise)], truth=truth),
         quietly(f.run, state, times, [truth + noise], truth=wrap(truth)),
     ]
-    # The Kalman filter, on the line.
+    # The Kalman filter, on the line: P + q, K = P / (P + R), and (1 - K) P.
+    allowed = max(tolerance(family), 1e-6) * 1.5
     mean = 2.9
     p = 0.04
     for k, y in enumerate((truth + noise)[:, 0]):
         p += 1e-3
         gain = p / (p + 0.01)
-        mean += 0.1 + gain * (y - mean - 0.1)
+        predicted = mean + 0.1
+        mean = predicted + gain * (y - predicted)
         p *= 1 - gain
         estimate = runs[0]["mean"].values[k, 0, 0]
         assert -np.pi <= estimate < np.pi
-        assert abs(wrap(estimate - mean)) < max(tolerance(family), 1e-6) * 1.5
+        assert abs(wrap(estimate - mean)) < allowed
     # Whether the truth or the observations wrap, the scores are those of the shorter way.
     for name in ("squared_error", "nees", "crps"):
         first = runs[0][name].values
@@ -319,7 +325,8 @@ def test_a_position_and_a_heading_that_wraps(family: str) -> None:
         p = x[..., :2]
         heading = x[..., 2:]
         step = np.concatenate([np.cos(heading), np.sin(heading)], axis=-1)
-        return np.concatenate([p + dt * step, wrap(heading + 0.01 * dt)], axis=-1)
+        turned = wrap(heading + 0.01 * dt)
+        return np.concatenate([p + dt * step, turned], axis=-1)
 
     model = Model(
         3,
@@ -342,7 +349,9 @@ def test_a_position_and_a_heading_that_wraps(family: str) -> None:
         seen = [Observation(k, 0, place, 0), Observation(k, 0, heading, 1)]
         state = quietly(f.step, state, float(k), [seen])
         error = f.summarize(state).mean[0] - x
-        worst = max(worst, np.abs(error[:2]).max(), abs(wrap(error[2])))
+        place_error = np.abs(error[:2]).max()
+        heading_error = abs(wrap(error[2]))
+        worst = max(worst, place_error, heading_error)
     assert worst < 0.25
 
 
@@ -371,9 +380,11 @@ def test_a_wide_prior_is_moved_on_the_line(family: str) -> None:
     f = FAMILIES[family](model, [None])
     state = start(f, [0.0], [[9.0]])
     before = f.summarize(state)
-    after = f.summarize(f.step(state, 1.0, [None]))
+    state = f.step(state, 1.0, [None])
+    after = f.summarize(state)
     # A turn by 1 rad moves the mean and keeps the variance of 9, of which a circle has at most π².
-    assert np.allclose(wrap(after.mean - before.mean - 1.0), 0.0, atol=1e-2)
+    turn_error = wrap(after.mean - before.mean - 1.0)
+    assert np.allclose(turn_error, 0.0, atol=1e-2)
     assert np.allclose(after.variance, before.variance, rtol=1e-2)
 
 
@@ -392,18 +403,22 @@ def test_the_mean_of_particles_on_both_sides(family: str) -> None:
         summary = f.summarize(state)
         assert abs(wrap(summary.mean[0, 0] - np.pi)) < 0.06
         # One and two observations of 0.2.
-        std = 0.2 / np.sqrt(k + 1)
-        assert abs(summary.variance[0, 0] ** 0.5 - std) < 0.04
+        expected_std = 0.2 / np.sqrt(k + 1)
+        std = np.sqrt(summary.variance[0, 0])
+        assert abs(std - expected_std) < 0.04
 
 
 @pytest.mark.parametrize("family", ["ensemble", "particle", "transport", "exact"])
 def test_members_that_are_given_with_a_cut(family: str) -> None:
     """Headings about π as a log has them: the prior's mean is π, its deviation 0.2."""
     f = FAMILIES[family](still(), [compass()])
-    members = wrap(np.pi + 0.2 * np.random.default_rng(0).standard_normal(f.members))
-    summary = f.summarize(f.start(members[:, None], rng=np.random.default_rng(1)))
+    z = np.random.default_rng(0).standard_normal(f.members)
+    members = wrap(np.pi + 0.2 * z)
+    state = f.start(members[:, None], rng=np.random.default_rng(1))
+    summary = f.summarize(state)
     assert abs(wrap(summary.mean[0, 0] - np.pi)) < 0.03
-    assert abs(summary.variance[0, 0] ** 0.5 - 0.2) < 0.02
+    std = np.sqrt(summary.variance[0, 0])
+    assert abs(std - 0.2) < 0.02
 
 
 def test_jitter_about_the_cut() -> None:
@@ -449,7 +464,8 @@ def test_fusion_of_headings_on_both_sides(rule: str) -> None:
         f = FAMILIES[family](still(), sensors, graphs.path(2), fusion=fusion, **more)
         state = start(f, [centre], [[0.04]])
         seen = [wrap([centre - 0.2]), wrap([centre + 0.2])]
-        summary = f.summarize(quietly(f.step, state, 0.0, seen))
+        after = quietly(f.step, state, 0.0, seen)
+        summary = f.summarize(after)
         assert np.all(np.abs(summary.mean) <= np.pi)
         results.append((wrap(summary.mean - centre), summary.variance))
     # Relative to their centre the beliefs about π are those about 0.5.
@@ -518,8 +534,10 @@ def test_increments_of_information_on_the_receivers_branch() -> None:
     # Each agent has its prior and both observations, 3.1 and 2 π - 3.1 in one branch.
     information = 1 / 0.04 + 2 / 0.01
     for belief, prior in zip(state.mixtures, (3.12, -3.12 + TURN), strict=True):
+        # m = (m₀/P₀ + Σ y/R) / (1/P₀ + 2/R)
         total = prior / 0.04 + (3.1 + TURN - 3.1) / 0.01
-        assert abs(wrap(belief.mean[0] - total / information)) < 1e-9
+        mean = total / information
+        assert abs(wrap(belief.mean[0] - mean)) < 1e-9
         assert np.allclose(belief.cov, 1 / information)
 
 
@@ -615,7 +633,8 @@ def test_the_page_s_wide_prior(family: str) -> None:
     truth = rng.multivariate_normal(*WIDE_PRIOR, size=2000)[None]
     wrapped = line_angle((0, 1), std=0.2)
     # A number without a period is compared as it is: next to the prediction of the mean.
-    y = wrapped.bring_near(wrapped.observe(truth, rng=rng), np.full(1, np.pi / 4))
+    observed = wrapped.observe(truth, rng=rng)
+    y = wrapped.bring_near(observed, np.full(1, np.pi / 4))
     values = []
     for sensor in (wrapped, line_angle_along_the_tangent()):
         f = WIDE_FILTERS[family](still_point, [sensor])
@@ -623,15 +642,17 @@ def test_the_page_s_wide_prior(family: str) -> None:
         run = f.run(state, [1.0], [y], truth=truth, scores=("nees", "crps"))
         # A component, the fraction of runs that are lost, and the CRPS: three cells of the table
         nees = run["nees"].values / 2
-        values += [nees.mean(), 100 * (nees > 10).mean(), run["crps"].values.mean()]
-    (row,) = re.findall(
-        rf"^\| {family} \|(.*)\|$", PAGE.read_text("utf-8"), re.MULTILINE
-    )
+        percent_lost = 100 * (nees > 10).mean()
+        crps = run["crps"].values.mean()
+        values += [nees.mean(), percent_lost, crps]
+    page = PAGE.read_text("utf-8")
+    (row,) = re.findall(rf"^\| {family} \|(.*)\|$", page, re.MULTILINE)
     printed = [float(cell.strip().removesuffix("%")) for cell in row.split("|")]
     # Two digits, rounded
     assert np.allclose(values, printed, rtol=0.0, atol=0.0055), values
     # That of the prior N(m, σ²) on average: σ / √π
-    assert f"CRPS of {5 / np.sqrt(np.pi):.2f} m" in PAGE.read_text("utf-8")
+    prior_crps = 5 / np.sqrt(np.pi)
+    assert f"CRPS of {prior_crps:.2f} m" in page
     assert values[0] < 1.4 < 1.8 < values[3]
     assert values[1] < 0.5 < 3.0 < values[4]
 
@@ -893,16 +914,17 @@ def test_a_likelihood_of_a_heading(family: str, with_moments: bool, gate: Any) -
     )
     f = LIKELIHOOD_FAMILIES[family](resting, [compass], gate_probability=gate)
     start = f.start(([3.0], [[0.09]]), rng=np.random.default_rng(1))
-    summary = f.summarize(f.step(start, 0.0, [[-3.0]]))
+    after = f.step(start, 0.0, [[-3.0]])
+    summary = f.summarize(after)
+    # The prior N(3, 0.09) times the von Mises density exp(κ cos(x - y)) with κ = 25
     grid = np.linspace(0.0, TURN, 20_001)
     density = np.exp(-((grid - 3.0) ** 2) / 0.18 + 25 * np.cos(grid + 3.0))
     density /= density.sum()
     mean = density @ grid
     variance = density @ (grid - mean) ** 2
-    got = float(summary.mean[0, 0]) % TURN, float(summary.variance[0, 0])
-    assert np.allclose(
-        got, (mean, variance), atol=0.04 if family == "transport" else 0.01
-    )
+    atol = 0.04 if family == "transport" else 0.01
+    assert np.isclose(summary.mean[0, 0] % TURN, mean, atol=atol)
+    assert np.isclose(summary.variance[0, 0], variance, atol=atol)
 
 
 @pytest.mark.parametrize("family", LIKELIHOOD_FAMILIES)

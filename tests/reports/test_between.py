@@ -41,7 +41,8 @@ def in_order(make: Any, prior: Any = PRIOR, model: Model = MOTION, **start: Any)
     f = make(model, [EYE])
     events = [Observation(t, 0, y) for t, y in zip(TIMES, SEEN, strict=True)]
     events += [Observation(late.t, 0, late.value) for late in LATE]
-    return f.final_state(f.run(f.start(prior, **start), None, events))
+    run = f.run(f.start(prior, **start), None, events)
+    return f.final_state(run)
 
 
 @pytest.mark.parametrize("lag", [5, 6, 9])
@@ -74,8 +75,9 @@ def move_with_frame() -> LinearModel:
 
     def noise_cov(t: float, dt: float) -> np.ndarray:
         # x = A(t) w with w of covariance ∫ C dt
+        w_cov = dt * np.array([[0.3, 0.1], [0.1, 0.2]])
         end = frame(t + dt)
-        return end @ (dt * np.array([[0.3, 0.1], [0.1, 0.2]])) @ end.T
+        return end @ w_cov @ end.T
 
     return LinearModel.from_transition(2, transition, noise_cov)
 
@@ -88,7 +90,8 @@ def test_a_model_that_depends_on_time_is_bridged_at_its_times(
     make = partial(filters.GaussianFilter, linearization=linearization)
     model = move_with_frame()
     f = make(model, [EYE], lag=5)
-    state = f.final_state(f.run(f.start(PRIOR), TIMES, [SEEN], delayed=LATE))
+    run = f.run(f.start(PRIOR), TIMES, [SEEN], delayed=LATE)
+    state = f.final_state(run)
     expected = in_order(make, model=model)
     assert np.allclose(state.means, expected.means, atol=1e-12)
     assert np.allclose(state.covariances, expected.covariances, atol=1e-12)
@@ -99,9 +102,11 @@ def test_each_time_between_is_kept_as_the_others_are(runs: tuple[int, ...]) -> N
     """The belief about the inserted time is that of a smoother which stepped there."""
     f = filters.GaussianFilter(MOTION, [EYE], lag=6)
     start = f.start(PRIOR, runs=runs)
-    state = f.step(f.step(start, 1.0, [[0.8]]), 2.0, [[2.3]])
-    state = f.step(state, 2.0, [None], delayed=[Observation(1.3, 0, [1.1])])
-    stepped = f.step(f.step(start, 1.0, [[0.8]]), 1.3, [[1.1]])
+    first = f.step(start, 1.0, [[0.8]])
+    state = f.step(first, 2.0, [[2.3]])
+    late = Observation(1.3, 0, [1.1])
+    state = f.step(state, 2.0, [None], delayed=[late])
+    stepped = f.step(first, 1.3, [[1.1]])
     stepped = f.step(stepped, 2.0, [[2.3]])
     # The joint belief about all times, with their cross-covariances
     assert state.times == stepped.times == (0.0, 1.0, 1.3)
@@ -140,8 +145,8 @@ def test_members_without_noise_are_exact() -> None:
     x = np.random.default_rng(0).standard_normal((60, 2))
     start = f.start(x, rng=np.random.default_rng(1))
     run = f.run(start, TIMES, [SEEN], delayed=LATE)
-    g = filters.GaussianFilter
-    expected = in_order(g, (x.mean(axis=0), np.cov(x.T)), still)
+    sample_moments = (x.mean(axis=0), np.cov(x.T))
+    expected = in_order(filters.GaussianFilter, sample_moments, still)
     assert np.allclose(run["mean"].values[-1], expected.means, atol=1e-9)
     variance = np.diagonal(expected.covariances, axis1=1, axis2=2)
     assert np.allclose(run["variance"].values[-1], variance, atol=1e-9)
@@ -173,7 +178,8 @@ def test_a_heading_between_two_sides_of_the_cut(family: str) -> None:
         state = f.step(start, 1.0, [[angle + 1.1]])
         state = f.step(state, 2.0, [[angle + 1.9]])
         late = Observation(1.4, 0, [angle + 1.2])
-        summaries.append(f.summarize(f.step(state, 2.0, [None], delayed=[late])))
+        state = f.step(state, 2.0, [None], delayed=[late])
+        summaries.append(f.summarize(state))
     level, turned = summaries
     # The second is turned by 1.5, and lies behind the cut, a whole turn less.
     assert turned.mean[0, 0] < -2.0
@@ -209,13 +215,13 @@ def test_a_network_exchanges_once_a_step_and_sends_the_late_one() -> None:
 
 def test_a_nonlinear_model_is_right_to_first_order() -> None:
     """A pendulum with small steps: the difference from stepping there is below the bend."""
-    swing = Model(
-        2,
-        lambda x, t, dt: np.stack(
-            [x[..., 0] + dt * x[..., 1], x[..., 1] - dt * np.sin(x[..., 0])], axis=-1
-        ),
-        lambda t, dt: 0.01 * dt * np.eye(2),
-    )
+
+    def transition(x: np.ndarray, t: float, dt: float) -> np.ndarray:
+        angle = x[..., 0] + dt * x[..., 1]
+        rate = x[..., 1] - dt * np.sin(x[..., 0])
+        return np.stack([angle, rate], axis=-1)
+
+    swing = Model(2, transition, lambda t, dt: 0.01 * dt * np.eye(2))
     f = filters.GaussianFilter(swing, [EYE], lag=4)
     state = f.step(f.start(PRIOR), 0.1, [[0.1]])
     late = f.step(state, 0.1, [None], delayed=[Observation(0.05, 0, [0.3])])
@@ -233,22 +239,19 @@ def test_times_outside_are_refused_by_name() -> None:
     # Before the oldest time that is kept; without any kept time; in smoothing; in a network
     with pytest.raises(ValueError, match="delayed must be of an earlier time"):
         f.step(state, 3.0, [None], delayed=[Observation(0.5, 0, [0.0])])
+    late = Observation(0.5, 0, [0.0])
     none = filters.GaussianFilter(MOTION, [EYE])
     with pytest.raises(ValueError, match="none with lag = 0"):
-        none.step(none.start(PRIOR), 1.0, [None], delayed=[Observation(0.5, 0, [0.0])])
+        none.step(none.start(PRIOR), 1.0, [None], delayed=[late])
     g = filters.GaussianFilter(MOTION, [EYE], lag=2)
+    between = Observation(1.5, 0, [0.0], arrival_time=3.0)
     with pytest.raises(ValueError, match="one of the times for smoothing"):
-        g.smooth(
-            g.start(PRIOR),
-            TIMES,
-            [SEEN],
-            delayed=[Observation(1.5, 0, [0.0], arrival_time=3.0)],
-        )
+        g.smooth(g.start(PRIOR), TIMES, [SEEN], delayed=[between])
     h = filters.GaussianFilter(
         MOTION, [EYE, None], graphs.path(2), lag=3, exchange_interval=2.0
     )
     with pytest.raises(ValueError, match="agents that exchange at intervals"):
-        h.step(h.start(PRIOR), 1.0, [None, None], delayed=[Observation(0.5, 0, [0.0])])
+        h.step(h.start(PRIOR), 1.0, [None, None], delayed=[late])
 
 
 def test_a_late_time_that_is_rounded_otherwise_is_the_one_that_is_kept() -> None:

@@ -162,7 +162,8 @@ def test_the_evidence_of_particles_is_the_mean_of_the_likelihoods() -> None:
     # The first NIS: of the equally weighted particles.
     r = SEEN[0] - x.mean(axis=0)
     s = np.cov(x.T, bias=True) + NOISE
-    assert np.isclose(run["nis"].values[0, 0], r @ np.linalg.solve(s, r))
+    nis = r @ np.linalg.solve(s, r)
+    assert np.isclose(run["nis"].values[0, 0], nis)
 
 
 def test_agents_of_a_transport_filter_share_the_evidence_of_all_observations() -> None:

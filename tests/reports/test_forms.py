@@ -84,6 +84,15 @@ def read_only(values: np.ndarray) -> np.ndarray:
     return result
 
 
+def as_table(values: np.ndarray) -> Any:
+    """A table, or a series, with an index that does not start at zero."""
+    index = range(5, 5 + len(values))
+    if values.ndim == 1:
+        return pd.Series(values, index=index)
+    columns = list("yxw")[: values.shape[1]]
+    return pd.DataFrame(values, index=index, columns=columns)
+
+
 FORMS: dict[str, Callable[[np.ndarray], Any]] = {
     "lists of integers": lambda a: a.astype(int).tolist(),
     "integers of eight bits": lambda a: a.astype(np.int8),
@@ -93,33 +102,28 @@ FORMS: dict[str, Callable[[np.ndarray], Any]] = {
     "a view backwards": lambda a: a[::-1].copy()[::-1],
     "read-only": read_only,
     "a tensor": Tensor,
-    "a table": lambda a: (
-        pd.DataFrame(a, index=range(5, 5 + len(a)), columns=list("yxw")[: a.shape[1]])
-        if a.ndim > 1
-        else pd.Series(a, index=range(5, 5 + len(a)))
-    ),
+    "a table": as_table,
 }
 
 
 def make(family: str, scales: Any = (1.0, 1.0)) -> Any:
     """A filter of two agents, each of which observes a component, in units of the scales."""
     scales = np.asarray(scales)
+    # A covariance has the products of the units.
     unit = np.outer(scales, scales)
-    motion = Model(
-        2,
-        lambda x, t, dt: x,
-        lambda t, dt: dt * np.array([[0.5, 0.1], [0.1, 0.3]]) * unit,
-    )
+    q = np.array([[0.5, 0.1], [0.1, 0.3]])
+    motion = Model(2, lambda x, t, dt: x, lambda t, dt: dt * q * unit)
     sensors = [component([k], std=0.5 * scales[k]) for k in range(2)]
     options = {}
     if family == "grid":
-        low, high = -12 * scales, 12 * scales
-        options["grid"] = density.Grid((40, 40), low=low, high=high)
+        edge = 12 * scales
+        options["grid"] = density.Grid((40, 40), low=-edge, high=edge)
     return FAMILIES[family](motion, sensors, PAIR, **options)
 
 
 def run_of(f: Any, prior: Any, times: Any, seen: Any) -> tuple[np.ndarray, np.ndarray]:
-    run = f.run(f.start(prior, rng=np.random.default_rng(3)), times, seen)
+    start = f.start(prior, rng=np.random.default_rng(3))
+    run = f.run(start, times, seen)
     return run["mean"].values, run["variance"].values
 
 
@@ -130,7 +134,8 @@ def test_the_same_numbers_in_another_form(family: str, form: str) -> None:
     f = make(family)
     plain = run_of(f, (MEAN, COV), TIMES, list(SEEN))
     prior = (convert(MEAN), convert(COV))
-    other = run_of(f, prior, convert(TIMES), [convert(y) for y in SEEN])
+    seen = [convert(y) for y in SEEN]
+    other = run_of(f, prior, convert(TIMES), seen)
     assert np.array_equal(plain[0], other[0])
     assert np.array_equal(plain[1], other[1])
 
@@ -155,14 +160,24 @@ def test_other_units(family: str, scales: tuple[float, float]) -> None:
 @pytest.mark.parametrize("family", ["extended", "unscented", "iterated", "sum"])
 def test_curved_sensors_in_other_units(family: str, unit: float) -> None:
     """The derivative by differences has steps in units of the state."""
-    curve = Sensor(1, lambda x: (x[..., :1] / unit) ** 2 + x[..., 1:] / unit, [[0.04]])
+
+    def bend(x: np.ndarray) -> np.ndarray:
+        plain = x / unit
+        return plain[..., :1] ** 2 + plain[..., 1:]
+
+    curve = Sensor(1, bend, [[0.04]])
     still = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
     f = FAMILIES[family](still, [curve], graphs.complete(1))
-    start = f.start((np.array([3.0, 1.0]) * unit, 0.01 * np.eye(2) * unit**2))
+    prior_mean = np.array([3.0, 1.0])
+    prior_cov = 0.01 * np.eye(2)
+    start = f.start((prior_mean * unit, prior_cov * unit**2))
     state = f.step(start, 0.0, [[10.3]])
     mean = f.summarize(state).mean[0] / unit
-    # The slope is [6, 1], so that S = .36 + .01 + .04, but for the curvature.
-    expected = np.array([3.0, 1.0]) + 0.01 * np.array([6.0, 1.0]) * 0.3 / 0.41
+    # m + P Hᵀ (y - h(m)) / S with H = [6, 1] and h(m) = 3² + 1, but for the curvature
+    slope = np.array([6.0, 1.0])
+    innovation = 10.3 - 10.0
+    innovation_var = 0.36 + 0.01 + 0.04
+    expected = prior_mean + prior_cov @ slope * innovation / innovation_var
     assert np.allclose(mean, expected, atol=3e-3)
 
 
@@ -171,14 +186,18 @@ def test_a_run_that_is_resumed_and_a_state_that_stays(
     family: str, tmp_path: Path
 ) -> None:
     f = make(family)
-    whole = f.run(f.start((MEAN, COV), rng=np.random.default_rng(3)), TIMES, list(SEEN))
+    start_of_whole = f.start((MEAN, COV), rng=np.random.default_rng(3))
+    whole = f.run(start_of_whole, TIMES, list(SEEN))
     start = f.start((MEAN, COV), rng=np.random.default_rng(3))
     before = f.summarize(start).mean.copy()
-    first = f.run(start, TIMES[:1], [y[:1] for y in SEEN])
+    early = [y[:1] for y in SEEN]
+    first = f.run(start, TIMES[:1], early)
     assert np.array_equal(f.summarize(start).mean, before)
     final_state(first).save(tmp_path / "state.npz")
     loaded = f.state_class.load(tmp_path / "state.npz")
     # Another filter with the same options goes on.
-    rest = make(family).run(loaded, TIMES[1:], [y[1:] for y in SEEN])
+    late = [y[1:] for y in SEEN]
+    rest = make(family).run(loaded, TIMES[1:], late)
     for name in ("mean", "variance", "scalars_total"):
-        assert np.array_equal(rest[name].values, whole[name].values[1:])
+        expected = whole[name].values[1:]
+        assert np.array_equal(rest[name].values, expected)

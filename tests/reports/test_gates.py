@@ -84,7 +84,9 @@ def steps_until_warned(f: Any, state: Any, values: list[Any]) -> tuple[list[int]
 def test_a_lost_track_is_told_once_after_ten(family: str) -> None:
     """fusioncore 38: in a row; one that passes starts the count anew, a missing one does not."""
     f, state = make(family)
-    values = [[NEAR], *[[FAR]] * 9, [NEAR], *[[FAR]] * 5, [None], *[[FAR]] * 9]
+    nine_far = [[FAR]] * 9
+    five_far = [[FAR]] * 5
+    values = [[NEAR], *nine_far, [NEAR], *five_far, [None], *nine_far]
     warned, state = steps_until_warned(f, state, values)
     # 1 + 9 + 1 observations, then five, a gap, and the tenth after it
     assert warned == [11 + 5 + 1 + 5]

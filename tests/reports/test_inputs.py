@@ -28,14 +28,11 @@ SIGMA = np.diag([0.04, 0.01])
 
 def drive(x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
     heading = x[..., 2]
-    return np.stack(
-        [
-            x[..., 0] + dt * u[..., 0] * np.cos(heading),
-            x[..., 1] + dt * u[..., 0] * np.sin(heading),
-            heading + dt * u[..., 1],
-        ],
-        axis=-1,
-    )
+    distance = dt * u[..., 0]
+    first = x[..., 0] + distance * np.cos(heading)
+    second = x[..., 1] + distance * np.sin(heading)
+    turned = heading + dt * u[..., 1]
+    return np.stack([first, second, turned], axis=-1)
 
 
 ODOMETRY = Inputs([0.0, 1.0, 2.0], [[1.0, 0.2], [2.0, -0.1], [0.5, 0.0]], SIGMA)
@@ -104,9 +101,10 @@ def test_members_are_draws_of_the_inputs(family: str) -> None:
     state = f.step(state, 1.5, [None])
     rng = np.random.default_rng(1)
     x = rng.multivariate_normal(*PRIOR, size=400_000)
-    # One draw for each input, which holds as long as it does
+    # One draw for each input, which holds as long as it does; Σ = diag(0.2², 0.1²)
     for dt, u in ((1.0, [1.0, 0.2]), (0.5, [2.0, -0.1])):
-        x = drive(x, u + rng.standard_normal((400_000, 2)) * [0.2, 0.1], dt)
+        noise = rng.standard_normal((400_000, 2)) * [0.2, 0.1]
+        x = drive(x, u + noise, dt)
     assert np.allclose(state.belief[0].mean(axis=0), x.mean(axis=0), atol=0.01)
     assert np.allclose(np.cov(state.belief[0].T), np.cov(x.T), atol=0.01)
 
@@ -182,4 +180,6 @@ def test_inputs_that_end_are_told_once() -> None:
     wind = Inputs([0.0], [[1.0]], [[0.01]])
     steady = InputModel.from_inputs(1, lambda x, u, dt: x + dt * u, wind)
     g = filters.GaussianFilter(steady, [None])
-    assert np.allclose(g.step(g.start(([0.0], [[1.0]])), 500.0, [None]).means, 500.0)
+    start = g.start(([0.0], [[1.0]]))
+    state = g.step(start, 500.0, [None])
+    assert np.allclose(state.means, 500.0)

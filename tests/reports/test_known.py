@@ -91,17 +91,18 @@ def test_kalman_filter_and_smoother_know_a_constant() -> None:
     f = np.array([[1.0, 0.5], [-0.2, 0.9]])
     long_f = np.pad(f, ((0, 1), (0, 1)))
     long_f[2, 2] = 1.0
+    long_q = np.pad(Q, ((0, 1), (0, 1)))
     noise = {"R": [[0.4]]}
     long = kalman_filter(
         *WITH_BIAS,
         SEEN + BIAS,
         F=long_f,
-        Q=np.pad(Q, ((0, 1), (0, 1))),
+        Q=long_q,
         H=[[1.0, 0.0, 1.0]],
         **noise,
     )
     short = kalman_filter(*PRIOR, SEEN, F=f, Q=Q, H=[[1.0, 0.0]], **noise)
-    smooth_long = rts_smoother(long, F=long_f, Q=np.pad(Q, ((0, 1), (0, 1))))
+    smooth_long = rts_smoother(long, F=long_f, Q=long_q)
     smooth_short = rts_smoother(short, F=f, Q=Q)
     # The blocks of the first two components, filtered and smoothed
     for a, b in ((long, short), (smooth_long, smooth_short)):
@@ -257,14 +258,17 @@ def test_maps_leave_constants_and_move_what_is_determined(
     """Beside x: 7, and 3 x - 1, which stay 7 and 3 x' - 1. Alone x moves as before."""
     rng = np.random.default_rng(1)
     x = rng.standard_normal((300, 2))
+    first = x[:, 0]
     seven = np.full(300, 7.0)
-    long = np.c_[seven, x[:, 0], units * (3 * x[:, 0] - 1), x[:, 1]]
+    determined = units * (3 * first - 1)
+    long = np.c_[seven, first, determined, x[:, 1]]
     update = partial(MAPS[name], predicted=x[:, :1], observed=[1.0], noise=[[0.5]])
     short = update(ensemble=x, rng=np.random.default_rng(2))
     moved = update(ensemble=long, rng=np.random.default_rng(2))
     assert (moved[:, 0] == 7.0).all()
     assert np.allclose(moved[:, [1, 3]], short, atol=1e-9)
-    assert np.allclose(moved[:, 2] / units, 3 * short[:, 0] - 1, atol=1e-8)
+    expected = 3 * short[:, 0] - 1
+    assert np.allclose(moved[:, 2] / units, expected, atol=1e-8)
     # In a stack too
     both = np.stack([long, long[::-1]])
     update = partial(MAPS[name], observed=[1.0], noise=[[0.5]])
@@ -283,7 +287,8 @@ def test_ensembles_with_maps_know_a_constant(name: str, lag: int) -> None:
         rest, [LINEAR_BIASED], update=MAPS[name], members=4000, lag=lag
     )
     state = f.start(WITH_BIAS, rng=np.random.default_rng(0))
-    state = f.step(f.step(state, 1.0, [None]), 2.0, [[1.5]])
+    state = f.step(state, 1.0, [None])
+    state = f.step(state, 2.0, [[1.5]])
     summary = f.summarize(state)
     # As the Kalman filter without the bias: S = 1 + .4, of an observation of 1
     assert np.allclose(summary.mean[0], [1.0, -0.5, BIAS], atol=0.05)

@@ -45,7 +45,8 @@ def count_moments(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def log_student(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return t.logpdf((y - x)[..., 0], df=3, scale=0.3)
+    residual = y - x
+    return t.logpdf(residual[..., 0], df=3, scale=0.3)
 
 
 def log_radar(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -118,7 +119,8 @@ def test_a_late_count_is_that_of_its_own_time(family: str) -> None:
     state = f.start(([1.0], [[1.0]]), rng=np.random.default_rng(0), t=0.0)
     state = f.step(state, 1.0, [None])
     late = Observation(0.0, 0, [6.0])
-    after = f.summarize(f.step(state, 1.0, [None], delayed=[late]))
+    state = f.step(state, 1.0, [None], delayed=[late])
+    after = f.summarize(state)
     # The belief about the first time is doubled: twice the mean and four times the variance.
     mean, variance = grid_moments(log_count, [6.0])
     assert abs(after.mean[0, 0] - 2 * mean) < 0.15
@@ -156,8 +158,10 @@ def test_the_nis_is_unknown_without_moments_and_its_numbers_count(family: str) -
     assert np.isfinite(state.log_likelihood).all()
     assert plain.n_observed.tolist() == ([1, 1] if shares else [1, 0])
     # r² / S; an agent without an observation has zero.
-    expected = 1.5**2 / ((1.0 if shares else 2.0) + 0.25)
-    assert np.allclose(plain.nis, [expected, expected if shares else 0.0])
+    variance = 1.0 if shares else 2.0
+    expected = 1.5**2 / (variance + 0.25)
+    of_neighbour = expected if shares else 0.0
+    assert np.allclose(plain.nis, [expected, of_neighbour])
     # A missing observation of such a sensor is none.
     gone = [[pair[0], Observation(0.0, 0, [np.nan], 1)], None]
     with warnings.catch_warnings():
@@ -177,7 +181,8 @@ def test_the_nis_of_runs_in_which_different_observations_are_missing(
     y = np.array([[0.1], [0.2], [np.nan]])
     z = np.array([[0.3], [np.nan], [0.4]])
     start = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0), runs=(3,))
-    state = f.step(start, 0.0, [[Observation(0.0, 0, y), Observation(0.0, 0, z, 1)]])
+    observed = [Observation(0.0, 0, y), Observation(0.0, 0, z, 1)]
+    state = f.step(start, 0.0, [observed])
     # In the second run the likelihood is missing, so that only there the NIS is a number.
     assert state.n_observed[:, 0].tolist() == [2, 1, 1]
     assert np.isnan(state.nis[:, 0]).tolist() == [True, False, True]
@@ -202,12 +207,11 @@ def test_weights_are_products_of_densities() -> None:
         ],
         None,
     ]
-    state = f.step(f.start(x, rng=np.random.default_rng(0)), 0.0, observed)
-    expected = (
-        norm.pdf(0.8, x[:, 0], 0.5)
-        * poisson.pmf(3, np.exp(x[:, 0]))
-        * poisson.pmf(5, np.exp(x[:, 0]))
-    )
+    start = f.start(x, rng=np.random.default_rng(0))
+    state = f.step(start, 0.0, observed)
+    rates = np.exp(x[:, 0])
+    counts = poisson.pmf(3, rates) * poisson.pmf(5, rates)
+    expected = norm.pdf(0.8, x[:, 0], 0.5) * counts
     assert np.allclose(state.weights, expected / expected.sum(), atol=1e-14)
     # The evidence is the mean of the likelihoods over equally weighted particles.
     assert np.allclose(state.log_likelihood, np.log(expected.mean()), atol=1e-12)
@@ -364,18 +368,18 @@ def test_one_of_two_components_is_missing(family: str, gate: float | None) -> No
         gate_probability=gate,
         record_evidence=True,
     )
-    run = f.run(
-        f.start(WIDE, rng=np.random.default_rng(0)), [1.0], [[[np.nan, 1.0]], None]
-    )
-    # S = .8 + .25, K = [.3, .8] / S
-    gain = np.array([0.3, 0.8]) / 1.05
+    start = f.start(WIDE, rng=np.random.default_rng(0))
+    run = f.run(start, [1.0], [[[np.nan, 1.0]], None])
+    # S = .8 + .25, K = [.3, .8] / S; the innovation is 1.
+    innovation_var = 0.8 + 0.25
+    gain = np.array([0.3, 0.8]) / innovation_var
     mean = run["mean"].values[0]
     # Five hundred members miss moments by some 0.05.
     atol = 0.15 if family == "transport" else 0.03
     assert np.allclose(mean, gain, atol=atol)
-    assert np.isclose(run["nis"][0, 0], 1 / 1.05, atol=atol)
+    assert np.isclose(run["nis"][0, 0], 1 / innovation_var, atol=atol)
     assert run["n_observed"][0, 0] == 1
-    expected = norm.logpdf(1.0, scale=np.sqrt(1.05))
+    expected = norm.logpdf(1.0, scale=np.sqrt(innovation_var))
     assert np.isclose(run["log_likelihood"][0, 0], expected, atol=0.05)
 
 

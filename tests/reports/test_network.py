@@ -415,7 +415,9 @@ def test_edges_between_names() -> None:
     walk = constant_velocity(sigma=0.1, axes=1)
     eyes = [component([0], std=1.0), None, None]
     f = GaussianFilter(walk, eyes, [("a", "c")], names=("a", "b", "c"))
-    state = f.step(f.start(([0.0, 0.0], np.eye(2))), 0.0, [[1.0], None, None])
+    start = f.start(([0.0, 0.0], np.eye(2)))
+    state = f.step(start, 0.0, [[1.0], None, None])
+    # With P = R = 1 the gain is one half; the agent without a link learns nothing.
     assert np.allclose(state.means[:, 0], [0.5, 0.0, 0.5])
     with pytest.raises(ValueError, match=r"agents \['a', 'b', 'c'\], got 'd'"):
         GaussianFilter(walk, eyes, [("a", "d")], names=("a", "b", "c"))

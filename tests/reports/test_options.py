@@ -31,7 +31,8 @@ COV = np.array([[1.0, 0.2], [0.2, 0.5]])
 
 
 def bend(x: np.ndarray, t: float, dt: float) -> np.ndarray:
-    return np.stack([x[..., 0] + dt * np.sin(x[..., 1]), x[..., 1]], axis=-1)
+    moved = x[..., 0] + dt * np.sin(x[..., 1])
+    return np.stack([moved, x[..., 1]], axis=-1)
 
 
 MODEL = Model(2, bend, lambda t, dt: 0.05 * dt * np.eye(2))

@@ -40,6 +40,7 @@ def track(
 ) -> tuple[float, float, int, ParticleState]:
     """Return the mean NEES of particles and of a Kalman filter, and the number of alarms."""
     rng = np.random.default_rng(seed)
+    # Q is diagonal, so that its root is that of its entries.
     root = np.sqrt(model.Q(0.0, 1.0))
     x = rng.normal(size=2)
     sensors = [component([0], std=0.3)]
@@ -56,10 +57,10 @@ def track(
             y = [[x[0] + 0.3 * rng.normal()]]
             state = f.step(state, k + 1.0, y)
             exact = kalman.step(exact, k + 1.0, y)
-            for column, summary in enumerate(
-                (f.summarize(state), kalman.summarize(exact))
-            ):
+            summaries = (f.summarize(state), kalman.summarize(exact))
+            for column, summary in enumerate(summaries):
                 assert summary.covariance is not None
+                # eᵀ P⁻¹ e for each of the two components
                 error = summary.mean[0] - x
                 solved = np.linalg.solve(summary.covariance[0], error)
                 nees[k, column] = error @ solved / 2
@@ -125,7 +126,8 @@ def test_jitter_does_not_disturb_where_the_noise_is_large() -> None:
     rng = np.random.default_rng(5)
     increments = rng.multivariate_normal(np.zeros(3), q, (steps, runs))
     truth = increments.cumsum(axis=0)
-    seen = truth @ h.T + rng.multivariate_normal(np.zeros(2), r, (steps, runs))
+    noise = rng.multivariate_normal(np.zeros(2), r, (steps, runs))
+    seen = truth @ h.T + noise
     exact = kalman_filter(np.zeros(3), np.eye(3), seen, F=np.eye(3), H=h, Q=q, R=r)
     variance = np.diagonal(exact.covariances, axis1=-2, axis2=-1)
     times = np.arange(1.0, steps + 1)
@@ -136,10 +138,14 @@ def test_jitter_does_not_disturb_where_the_noise_is_large() -> None:
         )
         rng = np.random.default_rng(1)
         state = f.start((np.zeros(3), np.eye(3)), runs=(runs,), rng=rng)
-        states = f.steps(state, times, [seen])
-        means = [s.weights[:, 0, None, :] @ s.particles[:, 0] for s in states]
-        error = np.stack(means)[:, :, 0] - exact.means
-        return float(np.sqrt((error**2 / variance).mean()))
+        means = []
+        for after in f.steps(state, times, [seen]):
+            # Σ w x of each run, as a product of a row and a matrix
+            mean = after.weights[:, 0, None, :] @ after.particles[:, 0]
+            means.append(mean[:, 0])
+        error = np.stack(means) - exact.means
+        relative_square = error**2 / variance
+        return float(np.sqrt(relative_square.mean()))
 
     assert measure_error(None) < 1.1 * measure_error(0.0) < 0.3
 
@@ -160,7 +166,9 @@ def test_what_families_are_worth() -> None:
     ancestors = np.repeat([3, 7, 50, 51], 25)
     arrays = (x[None], weights[None], ancestors[None], np.array([True]))
     sizes, shares = measure_families(*arrays)
-    assert sizes[0] == pytest.approx(1 / (mass**2).sum())
+    # Var Σ W_j c_j = σ² Σ W_j² is that of 1 / Σ W_j² equal families.
+    squares = mass**2
+    assert sizes[0] == pytest.approx(1 / squares.sum())
     assert shares[0] == pytest.approx(0.0, abs=1e-12)
     # Members that are spread like all particles are not worth less for their ancestors.
     spread = rng.normal(size=(1, 100, 1))

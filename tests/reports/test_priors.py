@@ -46,10 +46,10 @@ def test_agents_start_from_their_own_gaussians(
         one = make(MOTION, EYES[:1])
         start = one.start(prior, runs=runs)
         alone = one.run(start, [1.0, 2.0], [SEEN[k]])
-        assert np.allclose(run["mean"].isel(agent=k), alone["mean"].isel(agent=0))
-        assert np.allclose(
-            run["variance"].isel(agent=k), alone["variance"].isel(agent=0)
-        )
+        for name in ("mean", "variance"):
+            in_team = run[name].isel(agent=k)
+            by_itself = alone[name].isel(agent=0)
+            assert np.allclose(in_team, by_itself)
 
 
 @pytest.mark.parametrize("cls", [filters.EnsembleFilter, filters.ParticleFilter])
@@ -60,11 +60,13 @@ def test_agents_start_from_their_own_members(cls: Any, runs: tuple[int, ...]) ->
     priors = [GAUSSIANS[0], multivariate_normal(*GAUSSIANS[1]), members]
     f = cls(MOTION, EYES, graphs.path(3), members=4000)
     state = f.start(priors, rng=np.random.default_rng(0), runs=runs)
-    mean = f.summarize(state).mean.reshape(-1, 3, 4)
-    variance = f.summarize(state).variance.reshape(-1, 3, 4)
-    for k in range(2):
-        assert np.allclose(mean[:, k], GAUSSIANS[k][0], atol=0.15)
-        assert np.allclose(variance[:, k], np.diag(GAUSSIANS[k][1]), rtol=0.15)
+    summary = f.summarize(state)
+    # By run (one or two), agent and component
+    mean = summary.mean.reshape(-1, 3, 4)
+    variance = summary.variance.reshape(-1, 3, 4)
+    for k, (prior_mean, prior_cov) in enumerate(GAUSSIANS[:2]):
+        assert np.allclose(mean[:, k], prior_mean, atol=0.15)
+        assert np.allclose(variance[:, k], np.diag(prior_cov), rtol=0.15)
     assert np.allclose(mean[:, 2], members.mean(axis=0))
     # Draws of the agents differ also where their priors are equal.
     equal = f.start([GAUSSIANS[0]] * 3, rng=np.random.default_rng(0))

@@ -98,8 +98,10 @@ def test_a_function_of_time_between_rare_truths() -> None:
     # At 1, 2.5 and 4 s between (0, 0), (2, 4) and (5, 1)
     x = np.array([2.0, 3.5, 2.0])
     error = record["squared_error"].values
+    # By time and agent; the second component is t for one agent, and -t for the other.
+    y = TIMES[:, None] * [1, -1]
     assert np.allclose(error[..., 0], (MEANS[:, 0] - x[:, None]) ** 2)
-    assert np.allclose(error[..., 1], (MEANS[:, 1] - TIMES[:, None] * [1, -1]) ** 2)
+    assert np.allclose(error[..., 1], (MEANS[:, 1] - y) ** 2)
     assert np.isnan(error[..., 2]).all()
     for agent, sign in enumerate((1, -1)):
         expected = nees(agent, MEANS[agent, :2] - [x[1], sign * 2.5], [0, 1])
@@ -147,7 +149,9 @@ def test_a_failed_run_of_members_has_no_score_and_gaps_have_none() -> None:
         lambda t, dt: np.zeros((1, 1)),
     )
     f = filters.EnsembleFilter(failing, [None], members=4, on_error="keep")
-    members = np.arange(4.0)[:, None] + np.array([0.0, 60.0])[:, None, None, None]
+    # By run and agent, four members with one component
+    offsets = np.array([0.0, 60.0])[:, None, None, None]
+    members = np.arange(4.0)[:, None] + offsets
     start = f.start(members, rng=np.random.default_rng(0), runs=(2,))
     truth = np.array([1.0, np.nan, 2.0])
     by_run = np.stack([truth, truth + 60.0], axis=1)[..., None]

@@ -113,9 +113,11 @@ def test_a_value_that_is_seen_again_at_another_time_counts() -> None:
         state = f.step(state, 2.0, [both])
         late = Observation(2.0, 0, [0.9])
         state = f.step(state, 3.0, [[Observation(3.0, 0, [0.3])]], delayed=[late])
+    # m = Σ y/R / (1/P₀ + Σ 1/R): four values of R = P₀, and 0.7 of R = 1
     values = np.array([0.3, 0.3, 0.3, 0.9])
     precision = 1 / scale + values.size / scale + 1.0
-    expected = (values.sum() / scale + 0.7) / precision
+    information = values.sum() / scale + 0.7
+    expected = information / precision
     assert np.isclose(state.means[0, 0], expected, rtol=1e-9)
 
 
@@ -230,24 +232,35 @@ LIKELIHOODS = [
 ]
 
 
+def members_of(weights: np.ndarray) -> np.ndarray:
+    """Return members 0, 1, 2, ... of one component, one for each weight."""
+    places = np.arange(float(len(weights)))
+    return places[:, None]
+
+
+def correct_members(weights: np.ndarray) -> np.ndarray:
+    x = members_of(weights)
+    return coupling.correct_moments(x, x, weights)
+
+
 @pytest.mark.parametrize("values", LIKELIHOODS)
 @pytest.mark.parametrize(
     "call",
     [
         effective_size,
-        lambda w: coupling.transform_ensemble(np.arange(float(len(w)))[:, None], w),
-        lambda w: coupling.transport_plans(np.arange(float(len(w)))[:, None], w),
-        lambda w: coupling.correct_moments(
-            np.arange(float(len(w)))[:, None], np.arange(float(len(w)))[:, None], w
-        ),
+        lambda w: coupling.transform_ensemble(members_of(w), w),
+        lambda w: coupling.transport_plans(members_of(w), w),
+        correct_members,
     ],
 )
 def test_likelihoods_in_place_of_logarithms(call: Any, values: list[float]) -> None:
+    weights = np.array(values)
     with pytest.warns(RuntimeWarning, match="log_weights must be logarithms"):
-        call(np.array(values))
+        call(weights)
     # Also where they no longer sum to exactly one
+    almost = weights * (1 - 1e-6)
     with pytest.warns(RuntimeWarning, match="log_weights must be logarithms"):
-        call(np.array(values) * (1 - 1e-6))
+        call(almost)
 
 
 @pytest.mark.parametrize(
@@ -483,9 +496,11 @@ def test_two_that_are_close_both_count() -> None:
         with warnings.catch_warnings(action="error"):
             state = f.step(start_of(f), 1.0, [two])
         # 1/P = 1/(1 + 1 + .03) + 2/.25, with P of the step by hand: F F' + Q
-        predicted = WALK.F(1.0) @ WALK.F(1.0).T + WALK.Q(0.0, 1.0)
-        variance = 1 / (1 / predicted[0, 0] + 2 / 0.25)
-        assert np.isclose(f.summarize(state).variance[0, 0], variance)
+        phi = WALK.F(1.0)
+        predicted = phi @ phi.T + WALK.Q(0.0, 1.0)
+        precision = 1 / predicted[0, 0] + 2 / 0.25
+        variance = f.summarize(state).variance[0, 0]
+        assert np.isclose(variance, 1 / precision)
 
 
 @EACH

@@ -63,7 +63,8 @@ def joint(
     def cross(r: float, s: float) -> np.ndarray:
         if r > s:
             return cross(s, r).T
-        return (drift(r) @ p0 @ drift(r).T + spread(r)) @ drift(s - r).T
+        cov = drift(r) @ p0 @ drift(r).T + spread(r)
+        return cov @ drift(s - r).T
 
     n = len(observed)
     y = np.empty(n)
@@ -81,7 +82,8 @@ def joint(
     # E[x | y] = E x + C_xy C_yy⁻¹ (y - E y)
     gain = np.linalg.solve(cov_y, cov_xy.T).T
     mean = drift(t) @ m0 + gain @ (y - mean_y)
-    return mean, cross(t, t) - gain @ cov_xy.T
+    cov = cross(t, t) - gain @ cov_xy.T
+    return mean, cov
 
 
 FAMILIES: dict[str, tuple[Any, float]] = {
@@ -118,10 +120,11 @@ def test_one_of_three_seconds_ago_and_then_one_of_two(family: str) -> None:
     state = f.start(PRIOR, rng=np.random.default_rng(0))
     for t, _, y in ON_TIME:
         state = f.step(state, t, [[Observation(t, 0, [y])]])
-    for t, y in ((2.0, 1.4), (2.5, 0.6), (3.0, 1.1)):
-        state = f.step(state, 5.0, [None], delayed=[Observation(t, 0, [y], 1)])
     # The one of 2.5 s is of no step's time.
     late = [(2.0, 1, 1.4), (2.5, 1, 0.6), (3.0, 1, 1.1)]
+    for t, number, y in late:
+        delayed = [Observation(t, 0, [y], number)]
+        state = f.step(state, 5.0, [None], delayed=delayed)
     check(state, f, [*ON_TIME, *late], tolerance)
 
 
@@ -166,8 +169,10 @@ def test_fixed_lag_smoothing_is_a_conditional_mean(lag: int) -> None:
     smoothed = f.smooth(f.start(PRIOR), TIMES, [np.array(SERIES)[:, None]])
     for k, t in enumerate(TIMES):
         mean, cov = joint(ON_TIME[: k + lag + 1], t)
-        assert np.allclose(smoothed["mean"].values[k, 0], mean, atol=1e-9)
-        assert np.allclose(smoothed["covariance"].values[k, 0], cov, atol=1e-9)
+        smoothed_mean = smoothed["mean"].values[k, 0]
+        smoothed_cov = smoothed["covariance"].values[k, 0]
+        assert np.allclose(smoothed_mean, mean, atol=1e-9)
+        assert np.allclose(smoothed_cov, cov, atol=1e-9)
 
 
 RNG = np.random.default_rng(3)
@@ -185,21 +190,23 @@ def joint_of_matrices() -> tuple[np.ndarray, np.ndarray]:
     m0, p0 = PRIOR
     maps = np.zeros((5, 2, 12))
     before = np.hstack([np.eye(2), np.zeros((2, 10))])
-    for k in range(5):
-        before = MATRICES[k] @ before
-        before[:, 2 + 2 * k : 4 + 2 * k] += np.eye(2)
-        maps[k] = before
-    root = np.zeros((12, 12))
-    root[:2, :2] = p0
-    for k in range(5):
-        block = slice(2 + 2 * k, 4 + 2 * k)
-        root[block, block] = NOISES[k]
     prior_mean = np.concatenate([m0, np.zeros(10)])
+    prior_cov = np.zeros((12, 12))
+    prior_cov[:2, :2] = p0
+    for k in range(5):
+        # x_k = F_k x_{k-1} + w_k, as a matrix that acts on (x₀, w₁, ..., w₅)
+        block = slice(2 + 2 * k, 4 + 2 * k)
+        before = MATRICES[k] @ before
+        before[:, block] += np.eye(2)
+        maps[k] = before
+        prior_cov[block, block] = NOISES[k]
+    # The five observations y = H (x₀, w₁, ..., w₅) + v at once
     h = maps[:, 0]
-    s = h @ root @ h.T + np.diag(VARIANCES)
-    gain = np.linalg.solve(s, h @ root).T
-    mean = prior_mean + gain @ (np.array(SERIES) - h @ prior_mean)
-    cov = root - gain @ h @ root
+    s = h @ prior_cov @ h.T + np.diag(VARIANCES)
+    gain = np.linalg.solve(s, h @ prior_cov).T
+    innovation = np.array(SERIES) - h @ prior_mean
+    mean = prior_mean + gain @ innovation
+    cov = prior_cov - gain @ h @ prior_cov
     return maps @ mean, maps @ cov @ maps.mT
 
 
@@ -282,12 +289,15 @@ def test_evidence_where_particles_resample_now_and_then(threshold: float) -> Non
     expected = 0.0
     for k, (t, _, y) in enumerate(ON_TIME):
         mean, cov = joint(ON_TIME[:k], t)
-        expected += norm.logpdf(y, mean[0], np.sqrt(cov[0, 0] + 0.16))
-    assert abs(float(run["log_likelihood"].sum()) - expected) < 0.05
+        innovation_var = cov[0, 0] + 0.16
+        expected += norm.logpdf(y, mean[0], np.sqrt(innovation_var))
+    log_likelihood = float(run["log_likelihood"].sum())
+    assert abs(log_likelihood - expected) < 0.05
     # Each way of resampling occurs: never, at some steps, at all of them.
     sizes = run["effective_size"].values[:-1, 0]
     n_due = int((sizes < threshold * 100_000).sum())
-    assert n_due in {0.0: (0,), 1.0: (4,)}.get(threshold, (1, 2, 3))
+    possible = {0.0: (0,), 1.0: (4,)}.get(threshold, (1, 2, 3))
+    assert n_due in possible
 
 
 @pytest.mark.parametrize("linearization", ["extended", "unscented"])
@@ -317,8 +327,10 @@ def test_missing_numbers_are_no_evidence(linearization: Any) -> None:
         block = cov[np.ix_(present, present)]
         law = multivariate_normal(mean[present], block)
         assert np.isclose(state.log_likelihood[0], law.logpdf(y[present]))
+        # rᵀ S⁻¹ r with the innovation r
         r = y[present] - mean[present]
-        assert np.isclose(state.nis[0], r @ np.linalg.solve(block, r))
+        nis = r @ np.linalg.solve(block, r)
+        assert np.isclose(state.nis[0], nis)
 
 
 # Resets.
@@ -343,10 +355,13 @@ def test_a_velocity_that_is_reset_has_no_share_in_the_position(family: str) -> N
     gain = p[:, 0] / (p[0, 0] + 0.16)
     m = m + gain * (3.9 - m[0])
     p = p - np.outer(gain, p[0])
-    after = f.summarize(f.step(state, 5.5, [[3.9]]))
+    state = f.step(state, 5.5, [[3.9]])
+    after = f.summarize(state)
     std = np.sqrt(np.diag(p))
-    assert np.abs((after.mean[0] - m) / std).max() < tolerance
-    assert np.abs(np.sqrt(after.variance[0]) / std - 1).max() < tolerance
+    mean_error = (after.mean[0] - m) / std
+    std_error = np.sqrt(after.variance[0]) / std - 1
+    assert np.abs(mean_error).max() < tolerance
+    assert np.abs(std_error).max() < tolerance
 
 
 @EACH
@@ -363,5 +378,7 @@ def test_an_observation_of_before_a_reset_does_not_undo_it(family: str) -> None:
     mean, cov = joint([*ON_TIME, (3.5, 0, 2.0)], 5.0)
     after = f.summarize(state)
     std = np.sqrt([cov[0, 0], 0.04])
-    assert np.abs((after.mean[0] - [mean[0], -2.0]) / std).max() < tolerance
-    assert np.abs(np.sqrt(after.variance[0]) / std - 1).max() < tolerance
+    mean_error = (after.mean[0] - [mean[0], -2.0]) / std
+    std_error = np.sqrt(after.variance[0]) / std - 1
+    assert np.abs(mean_error).max() < tolerance
+    assert np.abs(std_error).max() < tolerance

@@ -29,8 +29,11 @@ EYE = Sensor(1, lambda x: x @ H.T, [[0.3]], linear=lambda d: H)
 
 
 def matrix(t: float, dt: float) -> np.ndarray:
+    # A turn with the rate t: the angle is ∫ t dt.
     angle = 0.5 * ((t + dt) ** 2 - t**2)
-    return np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    c = np.cos(angle)
+    s = np.sin(angle)
+    return np.array([[c, s], [-s, c]])
 
 
 TURN = LinearModel.from_transition(2, matrix, lambda t, dt: dt * Q)

@@ -63,6 +63,7 @@ TIMES = np.arange(1.0, 6.0)
 def truncated() -> tuple[float, float]:
     """The posterior on a grid: states out of range contradict each observation."""
     x = np.linspace(-12.0, 20.0, 6401)
+    # The prior N(4, 4)
     density = np.exp(-0.5 * (x - 4) ** 2 / 4)
     # Process noise of variance 0.01 in each step, on the grid's spacing
     offsets = np.arange(-200, 201) * 0.005
@@ -115,11 +116,12 @@ def test_the_others_leave_out_count_and_say_so_once(make: Any) -> None:
 
 def test_unscented_leaves_out_the_component_alone() -> None:
     """The other component acts as if it came alone."""
-    pair = Sensor(
-        2,
-        lambda x: np.concatenate([np.where(np.abs(x) < 5, x, np.nan), x**2], -1),
-        np.diag([0.04, 0.5]),
-    )
+
+    def observe_both(x: np.ndarray) -> np.ndarray:
+        near = np.where(np.abs(x) < 5, x, np.nan)
+        return np.concatenate([near, x**2], axis=-1)
+
+    pair = Sensor(2, observe_both, np.diag([0.04, 0.5]))
     square = Sensor(1, lambda x: x**2, [[0.5]])
     states = []
     for sensor, y in ((pair, [3.1, 9.0]), (square, [9.0])):
@@ -214,7 +216,9 @@ def test_a_mixture_contradicts_by_component() -> None:
     start = f.start(([0.0], [[0.1]]))
     state = f.step(start, 1.0, [[0.3]])
     # P = 0.1 + 0.01 and R = 0.04, so that the gain is P / (P + R)
-    assert state.mixtures[0].means[0, 0] == pytest.approx(0.3 * 0.11 / 0.15)
+    gain = 0.11 / 0.15
+    mean = state.mixtures[0].means[0, 0]
+    assert mean == pytest.approx(gain * 0.3)
 
 
 def test_the_multiplicative_filter_says_so() -> None:
@@ -307,8 +311,10 @@ def test_either_component_is_missing_at_each_time() -> None:
         if len(present):
             # The marginal density of the present components has their block of R.
             r = np.array(y)[present] - x[:, present]
-            inverse = np.linalg.inv(noise[np.ix_(present, present)])
-            logs = logs - 0.5 * np.einsum("ni,ij,nj->n", r, inverse, r)
+            block = noise[np.ix_(present, present)]
+            # rᵀ R⁻¹ r of each particle
+            squares = np.einsum("ni,ij,nj->n", r, np.linalg.inv(block), r)
+            logs = logs - 0.5 * squares
         weights = np.exp(logs - logs.max())
         assert np.allclose(state.weights[0], weights / weights.sum(), atol=1e-12)
 
@@ -327,15 +333,19 @@ def test_a_direction_at_a_range_of_zero(linearization: Any) -> None:
     f = GaussianFilter(still, [flow], linearization=linearization)
     cov = np.diag([0.5, 0.3])
     with pytest.warns(RuntimeWarning, match=MESSAGE):
-        state = f.step(f.start(([0.0, 0.0], cov)), 0.0, [[0.4]])
+        start = f.start(([0.0, 0.0], cov))
+        state = f.step(start, 0.0, [[0.4]])
     assert state.unseen.tolist() == [1.0]
     assert np.allclose(state.covariances[0], cov)
     assert np.allclose(state.means[0], 0.0)
     # Away from there it is used: H = (y², -x y) / r³.
     mean = np.array([3.0, 4.0])
-    used = f.step(f.start((mean, 1e-4 * cov)), 1.0, [[0.7]])
+    small_cov = 1e-4 * cov
+    start = f.start((mean, small_cov))
+    used = f.step(start, 1.0, [[0.7]])
     h = np.array([16.0, -12.0]) / 125
-    gain = 1e-4 * cov @ h / (h @ (1e-4 * cov) @ h + 0.01)
+    innovation_var = h @ small_cov @ h + 0.01
+    gain = small_cov @ h / innovation_var
     # K (y - x / r) at (3, 4), where x / r is 0.6
     assert np.allclose(used.means[0], mean + gain * (0.7 - 0.6), atol=1e-7)
 
@@ -422,11 +432,15 @@ def test_a_sum_at_a_singular_point_says_so() -> None:
     rounded = Sensor(1, lambda x: np.round(x, 1), [[0.01]])
     f = filters.GaussianSumFilter(still_model(1), [rounded])
     with pytest.warns(RuntimeWarning, match="derivative is zero at every component"):
-        run = f.run(f.start(([1.23], [[0.04]])), [1.0], [[[1.5]]])
+        start = f.start(([1.23], [[0.04]]))
+        run = f.run(start, [1.0], [[[1.5]]])
     assert run["unseen"][0, 0] == 1
     assert np.allclose(run["mean"], 1.23)
     # Points of an unscented filter see the slope, and components that differ are weighted.
     g = filters.GaussianSumFilter(still_model(1), [rounded], linearization="unscented")
-    assert g.step(g.start(([1.23], [[0.04]])), 1.0, [[1.5]]).component_means[0, 0] > 1.4
+    start = g.start(([1.23], [[0.04]]))
+    unscented = g.step(start, 1.0, [[1.5]])
+    assert unscented.component_means[0, 0] > 1.4
     two = GaussianMixture([0.5, 0.5], [[1.02], [1.48]], [[[1e-4]], [[1e-4]]])
-    assert f.step(f.start(two), 1.0, [[1.5]]).weights[0, 1] > 0.99
+    weighted = f.step(f.start(two), 1.0, [[1.5]])
+    assert weighted.weights[0, 1] > 0.99

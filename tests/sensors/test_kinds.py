@@ -312,13 +312,16 @@ LANDMARK_BEARING = np.arctan2(4.0, 3.0) - 0.5
 )
 def test_a_sensor_on_a_body_of_the_state(sensor: Sensor, value: list[float]) -> None:
     """Values by hand; the derivative is that of the prediction, also by the sensor's own pose."""
-    states = np.stack([ROBOT_AND_LANDMARK, ROBOT_AND_LANDMARK + [1.0, 0, 0, 1.0, 0]])
+    # Both are moved by 1 along the first axis, which changes neither distance nor bearing.
+    moved = ROBOT_AND_LANDMARK + [1.0, 0, 0, 1.0, 0]
+    states = np.stack([ROBOT_AND_LANDMARK, moved])
     assert np.allclose(sensor.predict(states), value, atol=1e-14)
-    h = 1e-6
-    shifted = states[:, None] + h * np.eye(5)
-    forward = sensor.predict(shifted)
-    backward = sensor.predict(states[:, None] - h * np.eye(5))
-    slope = (forward - backward).mT / (2 * h)
+    # Central differences: (h(x + ε e_j) - h(x - ε e_j)) / 2 ε
+    size = 1e-6
+    shift = size * np.eye(5)
+    forward = sensor.predict(states[:, None] + shift)
+    backward = sensor.predict(states[:, None] - shift)
+    slope = (forward - backward).mT / (2 * size)
     assert np.allclose(sensor.jacobian(states), slope, atol=1e-8)
 
 

@@ -298,9 +298,11 @@ def test_a_single_observation_is_localised_by_a_tapered_gain() -> None:
     x = members(20)
     places = np.array([[0.0], [1.5], [7.0]])
     observation_places = np.array([[0.5]])
+    # The perturbations that `enkf` draws with this seed, of variance R = 0.5
     zeta = np.sqrt(0.5) * rng(3).standard_normal((20, 1))
     distances = np.abs(places - observation_places)[:, 0]
     rho = gaspari_cohn(distances / 2)
+    # The first component is observed: K = P e₁ / (P₁₁ + R).
     covariance = np.cov(x.T)
     innovation_variance = covariance[0, 0] + 0.5
     gain = rho * covariance[:, 0] / innovation_variance
