@@ -64,7 +64,7 @@ from .record import (
     final_state,
     record_run,
 )
-from .repetition import drop_repeated
+from .repetition import drop_repeated, find_rounded_copy
 from .resets import Reset, read_reset
 from .states import SensorState, State
 from .step import Step
@@ -381,11 +381,9 @@ class Filter(FrozenModel, ABC, Generic[S]):
         if repeated:
             step.warn_once("repeated", _describe_repetition(repeated[0]))
         if sensor_filter is not None and (is_single or matched):
-            unplanned = [*read, matched] if is_single else [matched]
-            # Angles below four turns need no closer look.
-            large = [o for part in unplanned for o in part if (abs(o.value) > 25).any()]
-            if large:
-                self._warn_of_degrees(step, large)
+            # The plan of a run has looked at all others.
+            parts = [*read, matched] if is_single else [matched]
+            self._warn_of_unplanned(step, [o for part in parts for o in part])
         try:
             return self.next_state(step)
         except RECOVERABLE as error:
@@ -394,14 +392,24 @@ class Filter(FrozenModel, ABC, Generic[S]):
                 raise
             raise FilterError((), None, t, error) from error
 
-    def _warn_of_degrees(
+    def _warn_of_unplanned(
         self, step: Step[S], observations: Sequence[Observation]
     ) -> None:
-        """Warn once of angles in degrees, in observations that are not part of a plan."""
-        sensors: Sequence[Sequence[Sensor]] = getattr(self, "agent_sensors", ())
-        text = find_degrees(sensors, observations)
-        if text is not None:
-            step.warn_once("degrees", text)
+        """Warn once of angles in degrees and of copies, in observations outside a plan."""
+        # Angles below four turns need no closer look.
+        large = [o for o in observations if (abs(o.value) > 25).any()]
+        if large:
+            sensors: Sequence[Sequence[Sensor]] = getattr(self, "agent_sensors", ())
+            text = find_degrees(sensors, large)
+            if text is not None:
+                step.warn_once("degrees", text)
+        assimilated = step.state.assimilated
+        # Times differ by rounding: to milliseconds, or in single precision.
+        is_near = step.dt < max(1e-3, 1e-6 * abs(step.t))
+        if assimilated and (is_near or step.delayed):
+            text = find_rounded_copy(observations, assimilated, step.model.dim)
+            if text is not None:
+                step.warn_once("rounded times", text)
 
     def check_state(self, state: S) -> None:
         """Refuse a state that is not of this filter."""

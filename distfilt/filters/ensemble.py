@@ -714,8 +714,9 @@ class TransportFilter(_EnsembleSummary):
         """Warn once if one member has nearly all the weight: its copies are left to go on from."""
         weights = normalize_weights(logs[~step.failed])
         size = effective_size_of(weights).min(initial=np.inf)
-        # An effective size of 1.1 means that one member has 95 % of the weight.
-        if size < 1.1:
+        # Of fewer than two members the weighted variance is half of the right one or less, and
+        # the loss grows from update to update.
+        if size < 2:
             time = format_number(step.t)
             problem = (
                 f"t = {time} s: an agent's weights have an effective size of {size:.1f}"

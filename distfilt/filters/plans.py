@@ -21,7 +21,7 @@ from ..validation import (
 )
 from ..validation.clocks import warn_of_clock
 from .observations import Observation, are_observations, list_by_agent
-from .repetition import is_equal_value
+from .repetition import describe_near_copy, is_equal_value
 
 if TYPE_CHECKING:
     from .base import Filter
@@ -150,23 +150,29 @@ def _find_near_copies(
     >>> _find_near_copies(0.0, sorted(events), events)
     "observations must have one time to count once, got the same value of agent 0's sensor ..."
     """
-    if len(times) < 2:
-        return None
-    gaps = np.diff(times, prepend=start)
-    usual = float(np.median(gaps))
-    for k in np.flatnonzero(gaps[1:] < _NEAR * usual).tolist():
+    for k in _find_near_times(start, np.array(times)):
         pairs = zip(by_time[times[k]], by_time[times[k + 1]], strict=True)
         for before, after in pairs:
             for one, other in product(before, after):
                 if one.sensor is not other.sensor and one.sensor != other.sensor:
                     continue
                 if is_equal_value(one.value, other.value):
-                    return (
-                        "observations must have one time to count once, got the same value of "
-                        f"agent {one.agent}'s sensor at t = {format_number(one.t)} s and "
-                        f"{other.t - one.t:.3g} s later: copies with rounded times count twice"
-                    )
+                    return describe_near_copy(one.agent, one.t, other.t)
     return None
+
+
+def _find_near_times(start: float, times: Array) -> list[int]:
+    """Return the places of times after which the next one follows much sooner than usual.
+
+    >>> _find_near_times(0.0, np.array([1.0, 1.0 + 1e-9, 2.0, 3.0]))
+    [0]
+    """
+    if len(times) < 2:
+        return []
+    gaps = np.diff(times, prepend=start)
+    usual = float(np.median(gaps))
+    places: list[int] = np.flatnonzero(gaps[1:] < _NEAR * usual).tolist()
+    return places
 
 
 def _find_unfit(
@@ -232,11 +238,32 @@ def _plan_series(
             _check_series(sensors[agent], series, agent)
         if series is not None and sensors:
             _warn_of_degrees(sensors, series, agent)
+    near = _find_near_rows(_find_near_times(state.t, grid), grid, series_by_agent)
+    if near is not None:
+        warnings.warn(near, RuntimeWarning, stacklevel=5)
     shapes: list[tuple[int, ...] | None] = []
     if f.reads_by_default:
         lead = (grid.size, *_runs_of(state))
         shapes = [(*lead, s[0].dim) if len(s) == 1 else None for s in sensors]
     return _list_rows(grid, series_by_agent, shapes)
+
+
+def _find_near_rows(
+    places: list[int], grid: Array, series_by_agent: list[Series | None]
+) -> str | None:
+    """Return a warning of rows that are the same as the next but for rounding of their time.
+
+    `places` are those of times that the next one follows much sooner than usual.
+    """
+    for agent, series in enumerate(series_by_agent):
+        # Sensors that are named with their values are found among the step's Observations.
+        if not isinstance(series, np.ndarray) or series.dtype.kind != "f":
+            continue
+        for k in places:
+            is_seen = not np.isnan(series[k]).all()
+            if is_seen and is_equal_value(series[k], series[k + 1]):
+                return describe_near_copy(agent, grid[k], grid[k + 1])
+    return None
 
 
 def _refuse_ambiguous(observations: object, n_agents: int, n_times: int) -> None:

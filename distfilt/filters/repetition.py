@@ -9,10 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..sensors import Sensor
-from ..validation import Array
+from ..validation import Array, format_number
 from .observations import Observation
 
-__all__ = ["Assimilated", "WithoutRepeats", "drop_repeated", "is_equal_value"]
+__all__ = [
+    "Assimilated",
+    "WithoutRepeats",
+    "describe_near_copy",
+    "drop_repeated",
+    "find_rounded_copy",
+    "is_equal_value",
+]
 
 Assimilated = tuple[float, int, int | Sensor, Array, tuple[float, ...]]
 """Time, agent, sensor (its number, or itself), value and metadata of an observation."""
@@ -81,6 +88,69 @@ def drop_repeated(
 
     new_observations = [keep_new(of_agent) for of_agent in observations]
     return WithoutRepeats(new_observations, keep_new(delayed), repeated)
+
+
+def find_rounded_copy(
+    observations: Sequence[Observation],
+    assimilated: Iterable[Assimilated],
+    dim: int,
+) -> str | None:
+    """Return a warning of an observation that came before, but for rounding of its time.
+
+    A single step does not know how far apart the times usually are. So one of the two times has to
+    be the other to some decimals, or in single precision.
+
+    >>> value = np.array([2.5])
+    >>> before = [(1.0, 0, 0, value, ())]
+    >>> find_rounded_copy([Observation(1.0004, 0, value)], before, dim=1)
+    "observations must have one time to count once, got the same value of agent 0's sensor at ..."
+    >>> find_rounded_copy([Observation(1.1, 0, value)], before, dim=1) is None
+    True
+    """
+    for t, agent, sensor, value, metadata in assimilated:
+        if np.isnan(value).all():
+            continue
+        for o in observations:
+            if o.agent != agent or not _is_rounded(t, o.t):
+                continue
+            if not is_equal_value(o.value, value):
+                continue
+            if _is_same(o, sensor, metadata, dim):
+                return describe_near_copy(agent, t, o.t)
+    return None
+
+
+_DECIMALS = range(3, 10)
+"""To so many decimals times are rounded, from milliseconds to nanoseconds."""
+
+
+def _is_rounded(time: float, other: float) -> bool:
+    """Whether one of two different times is the other one, rounded.
+
+    >>> _is_rounded(0.1, float(np.float32(0.1))), _is_rounded(1.25, 1.2)
+    (True, False)
+    """
+    if time == other:
+        return False
+    for exact, rounded in ((time, other), (other, time)):
+        if np.float32(exact) == rounded:
+            return True
+        if any(round(exact, decimals) == rounded for decimals in _DECIMALS):
+            return True
+    return False
+
+
+def describe_near_copy(agent: int, t: float, later: float) -> str:
+    """Return the warning of two equal values of an agent's sensor at nearly the same time.
+
+    >>> describe_near_copy(2, 1.0, 1.0 + 2**-20)
+    "observations must have one time to count once, got the same value of agent 2's sensor at ..."
+    """
+    return (
+        f"observations must have one time to count once, got the same value of agent {agent}'s "
+        f"sensor at t = {format_number(t)} s and {later - t:.3g} s later: copies with rounded "
+        "times count twice"
+    )
 
 
 def is_equal_value(value: Array, other: Array) -> bool:

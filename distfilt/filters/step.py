@@ -563,7 +563,8 @@ class Step(Generic[S]):
         if self.streaks is not None:
             fields["rejection_streaks"] = self.streaks.counts
         if self.rejected is not None:
-            fields["rejected"] = self.rejected
+            # A failed run has no counts.
+            fields["rejected"] = self.keep_failed(self.rejected, np.nan)
         # The messages in the step are in the channel's ledger.
         ledger = state.ledger if self.channel is None else self.channel.ledger
         # A failed run has no score.

@@ -15,7 +15,11 @@ __all__: list[str] = []
 
 
 def from_matrix(value: object, name: str, *, directed: bool) -> scipy.sparse.csr_array:
-    """Return the links that a matrix of zeros and ones marks, an array or sparse."""
+    """Return the links that a matrix of zeros and ones marks, an array or sparse.
+
+    Entry (i, j) marks a link from agent j to agent i. Unless `directed`, every link must go both
+    ways.
+    """
     if not scipy.sparse.issparse(value):
         # Booleans are no numbers to `check_array`, but here they are zeros and ones.
         if isinstance(value, np.ndarray) and value.dtype == bool:
@@ -173,6 +177,7 @@ def number_edges(value: object, names: Sequence[str], name: str) -> object:
     Traceback (most recent call last):
     ValueError: graph must have edges between the agents ['a', 'b', 'c'], got 'd'
     """
+    # Anything else than a list of pairs of names is returned as it is.
     if not isinstance(value, list | tuple) or not value:
         return value
     for pair in value:
@@ -180,6 +185,7 @@ def number_edges(value: object, names: Sequence[str], name: str) -> object:
         if not is_pair or not all(isinstance(end, str) for end in pair):
             return value
     number_of = {label: number for number, label in enumerate(names)}
+    # An end that is no agent's name is refused.
     edges = []
     for pair in value:
         for end in pair:

@@ -102,6 +102,7 @@ def gaussian_belief_propagation(
     before = received
     for _ in range(rounds):
         before = received
+        # J_ii + Σ Λ and h_i + Σ η of what has arrived
         matrix, vector = _add_received(matrices, vectors, received, channel)
         # M and h: all that the sender knows without the receiver's own message
         last_lambda, last_eta = unpack_information(received, d)
@@ -120,8 +121,10 @@ def gaussian_belief_propagation(
     matrix, vector = _add_received(matrices, vectors, received, channel)
     covs = symmetrise(_invert(matrix))
     means = (covs @ vector[..., None])[..., 0]
-    if graph.senders.size // 2 > graph.n_agents - 1 - int(graph.components.max()):
-        # On a graph with circles
+    # A forest of C trees has A - C edges, each a link both ways; components are numbered from 0.
+    n_forest_edges = graph.n_agents - (1 + int(graph.components.max()))
+    if graph.senders.size // 2 > n_forest_edges:
+        # On a graph with circles the last round shows whether the messages have converged.
         last = _add_received(matrices, vectors, before, channel)
         _warn_of_changes(means, covs, *last, rounds)
     return means, covs
@@ -130,8 +133,13 @@ def gaussian_belief_propagation(
 def _warn_of_changes(
     means: Array, covs: Array, matrix: Array, vector: Array, rounds: int
 ) -> None:
-    """Warn if the means still moved in the last round, before which they were M⁻¹ h."""
+    """Warn if the means still moved in the last round, before which they were M⁻¹ h.
+
+    Here M and h are `matrix` and `vector`, and means and covariances those of the last round.
+    Shapes are (*runs, A, d) and (*runs, A, d, d).
+    """
     previous = (_invert(matrix) @ vector[..., None])[..., 0]
+    # Changes in units of each component's standard deviation
     std = np.sqrt(np.diagonal(covs, axis1=-2, axis2=-1))
     change = (np.abs(means - previous) / std).max(initial=0.0)
     if change > _MOVED:

@@ -1,4 +1,8 @@
-"""The channel between agents: it delivers messages along the links and keeps the ledger."""
+"""The channel between agents: it delivers messages along the links and keeps the ledger.
+
+In shapes A is the number of agents, E that of links, and R that of independent runs of the network,
+all of them in one axis; ``*runs`` are the runs in the axes that the caller gave them.
+"""
 
 from __future__ import annotations
 
@@ -219,6 +223,7 @@ class Channel:
             and integers become floats there.
         """
         graph = self.graph
+        # Read-only copies, and the scalars and bytes of each, (A,)
         copies, scalars, bytes_ = _count_payloads(payloads, graph.n_agents, self.runs)
         # Copies have the types of what was given.
         sent = cast(list[P], copies)
@@ -234,11 +239,12 @@ class Channel:
             is_common=True,
         )
         used = sends[graph.senders]
+        # Which messages arrive in each run, (R, E)
         arrived = self._transmit(used, size)
         # A message is in the inbox if any run has received it.
         received = np.flatnonzero(arrived.any(axis=0))
         inbox = _group_by_receiver(graph, sent, received)
-        # Runs that have lost it find NaN.
+        # Where some runs have lost it, the receiver's entry for the sender is NaN in those.
         in_all_runs = arrived[:, received].all(axis=0)
         for link in received[~in_all_runs].tolist():
             receiver = int(graph.receivers[link])
@@ -281,8 +287,10 @@ class Channel:
         """
         graph = self.graph
         n_links = graph.senders.size
+        # Read-only copies, and the scalars and bytes of each, (E,)
         copies, scalars, bytes_ = _count_payloads(payloads, n_links, self.runs)
         sent = cast(list[P | None], copies)
+        # The size of a transmission that serves all receivers, for the bill by broadcast
         transmission = None
         if common is not None:
             _copies, agent_scalars, agent_bytes = _count_payloads(
@@ -291,6 +299,7 @@ class Channel:
             transmission = _Transmission(agent_scalars, agent_bytes)
         size = _Size(scalars, bytes_, transmission)
         used = np.array([payload is not None for payload in sent], dtype=bool)
+        # Which messages arrive in each run, (R, E)
         arrived = self._transmit(used, size)
         result: list[P | None] = []
         for link, payload in enumerate(sent):
@@ -299,6 +308,7 @@ class Channel:
             elif arrived[:, link].all():
                 result.append(payload)
             else:
+                # The runs that have lost the message find NaN.
                 by_run = arrived[:, link].reshape(self.runs)
                 result.append(cast(P, _mask_lost(payload, by_run)))
         return result
@@ -386,13 +396,17 @@ class Channel:
             acknowledged=acknowledged,
             is_broadcast=is_broadcast,
         )
+        # Flags (*runs, E)
         by_run = arrived.reshape(*self.runs, self.graph.senders.size)
         return np.where(by_run[..., None], values, np.nan)
 
     def _mix_without_faults(
         self, values: Array, weights: ConsensusWeights, rounds: int
     ) -> Array:
-        """Mix values (*runs, A, k) in rounds in which every message arrives at once."""
+        """Mix values (*runs, A, k) in rounds in which every message arrives at once.
+
+        The weights are those of each agent's value and of each link.
+        """
         # The ledger adds these rounds when it is read: each time it would cost more than the
         # product.
         size = values.shape[-1]
@@ -402,6 +416,7 @@ class Channel:
         flat = agents_first.reshape(self.graph.n_agents, -1)
         for _ in range(rounds):
             flat = weights.matrix @ flat
+        # Back to (*runs, A, k)
         mixed = np.moveaxis(flat.reshape(agents_first.shape), 0, -2)
         return np.ascontiguousarray(mixed)
 
@@ -432,11 +447,13 @@ class Channel:
         # Metropolis weights need the sender's number of working links: one number more.
         numbers = size + 1 if on_loss == "metropolis" else size
         flat = values.reshape(-1, size)
-        # Losses and weights of many rounds at once, as many as the cache holds.
+        # Losses and weights of many rounds at once, as many as the cache holds. Losses are drawn
+        # for all runs of the batch, also where this channel is for one of them.
         block = max(1, _BLOCK_SIZE // (1 + self._n_all_runs * self.graph.senders.size))
         while rounds > 0:
             # Every link carries a message in every round. If both ends must know whether it came,
             # the receiver acknowledges it.
+            # Which messages arrive is (count, R, E).
             used = np.ones(self.graph.senders.size, dtype=bool)
             count = min(rounds, block)
             arrived = self._transmit_rounds(
@@ -475,9 +492,11 @@ class Channel:
             offset = len(flat)
             arrived = self._delay_arrivals(flat.shape, arrived)
         n_rounds, n_runs, n_links = arrived.shape
+        # Weights of all rounds and runs, (rounds R, A) and (rounds R, E)
         self_weights, link_weights = _weights_after_loss(
             graph, weights, arrived.reshape(n_rounds * n_runs, n_links), on_loss
         )
+        # One block-diagonal matrix for the R runs of the first round
         matrix = stack_weights(
             graph, self_weights[:n_runs], link_weights[:n_runs], received_offset=offset
         )
@@ -522,18 +541,28 @@ class Channel:
         acknowledged: bool = False,
         is_broadcast: bool = True,
     ) -> Mask:
-        """Send so many floats over links (E,), all by default; return which arrive, (R, E)."""
+        """Send so many floats over links (E,), all by default; return which arrive, (R, E).
+
+        Arguments are those of :meth:`send_on_links`; with R runs and E links.
+        """
+        # The usual case is faster.
         if links is None and self._perfect and is_broadcast and not acknowledged:
             return self._transmit_everywhere(numbers)
         if links is None:
             links = self.graph._every_link
+        # Scalars and bytes of a message, eight bytes a float; without `of_floats` there is no
+        # transmission that serves all receivers.
         size = _Size.of_floats(numbers)
         if not is_broadcast:
             size = _Size(numbers, 8 * numbers)
         return self._transmit(links, size, acknowledged=acknowledged)
 
     def _transmit(self, used: Mask, size: _Size, *, acknowledged: bool = False) -> Mask:
-        """Charge one round on the links in use, and return which messages arrive, (R, E)."""
+        """Charge one round on the links in use, and return which messages arrive, (R, E).
+
+        The links in use are a mask (E,), and `size` is that of a message. An acknowledged message
+        costs its receiver a byte in return.
+        """
         if self.faults.total_delay:
             raise ValueError(
                 "channel must have no delay here, "
@@ -544,6 +573,7 @@ class Channel:
                 count=1, used=used, size=size, acknowledged=acknowledged
             )
             return np.asarray(arrived[0])
+        # Without faults every message arrives, in each run.
         self._charge(used[None], size, acknowledged=acknowledged)
         if self._n_all_runs == 1:
             return used[None]
@@ -560,10 +590,15 @@ class Channel:
     def _charge_broadcast(
         self, sent: Sequence[Payload | None], scalars: Counts, bytes_: Counts
     ) -> None:
-        """Charge a round in which agents send payloads of these sizes to all their receivers."""
+        """Charge a round in which agents send payloads of these sizes to all their receivers.
+
+        The payload of each agent is in `sent`, None for silence; scalars and bytes are (A,).
+        """
         graph = self.graph
+        # 1 for an agent that sends, 0 for a silent one
         sends = np.array([payload is not None for payload in sent], dtype=np.int64)
         bill = []
+        # First by link, a message to each receiver, then by broadcast, one transmission to all.
         for count in (graph.messages_a_round, graph.is_sender):
             used = count * sends
             bill += [used, used * scalars, used * bytes_]
@@ -589,7 +624,11 @@ class Channel:
     def _transmit_rounds(
         self, count: int, used: Mask, size: _Size, *, acknowledged: bool
     ) -> Mask:
-        """Charge some rounds with faults, and return which messages arrive, (count, R, E)."""
+        """Charge some rounds with faults, and return which messages arrive, (count, R, E).
+
+        The links in use are a mask (E,), and `size` is that of a message; there are R runs. An
+        acknowledged message costs its receiver a byte in return.
+        """
         graph = self.graph
         first = self.ledger.rounds
         # A graph without links has no rounds, so that their number does not grow.
@@ -601,6 +640,7 @@ class Channel:
         draws = self.faults.draw_rounds(
             graph, range(first, first + count), self._n_all_runs, self.t
         )
+        # The losses are those of all runs of the batch, of which this channel has its own.
         arrived = used_by_round[:, None] & ~draws[:, self._own_runs]
         # The ledger counts losses as the mean over the runs. Rounds are added one after the other,
         # so that a block of rounds gives the same floating-point sum as single ones.
@@ -667,7 +707,8 @@ class Channel:
     ) -> list[Counts]:
         """Return messages, scalars and bytes of each agent per link, then per transmission.
 
-        That is the order of the ledger's fields in `_BILLS`.
+        That is the order of the ledger's fields in `_BILLS`. The arguments are those of
+        :meth:`_charge`. Each count is (A,).
         """
         graph = self.graph
         if size.is_common and size.transmission is not None and not acknowledged:
@@ -681,6 +722,7 @@ class Channel:
                 links_in_use = self._count_by_agent(graph.senders, uses)
                 messages = np.asarray(links_in_use, dtype=np.int64)
                 sends = repeated * self._count_transmissions(used_by_round)
+            # A message on a link is as large as a transmission.
             scalars, bytes_ = size.transmission
             links_bill = [messages, messages * scalars, messages * bytes_]
             return [*links_bill, sends, sends * scalars, sends * bytes_]
@@ -688,7 +730,9 @@ class Channel:
         uses = repeated * used_by_round.sum(axis=0)
         by_link: list[Counts | Array] = []
         for weights in (uses, uses * size.scalars, uses * size.bytes):
+            # The sum over the links on which an agent sends
             by_link.append(self._count_by_agent(graph.senders, weights))
+        # Without a common one each message is a transmission of its own.
         by_agent = by_link
         if size.transmission is not None:
             sends = repeated * self._count_transmissions(used_by_round)
@@ -705,6 +749,7 @@ class Channel:
     def _count_transmissions(self, used_by_round: Mask) -> Counts:
         """Return in how many rounds each agent sends on any link, (A,)."""
         graph = self.graph
+        # Every agent that has a receiver sends in every round.
         if used_by_round.all():
             return len(used_by_round) * graph.is_sender
         sends = np.zeros(graph.n_agents, dtype=np.int64)
@@ -745,6 +790,7 @@ def _count_payloads(
         copies = [_copy_part(part, agent, runs) for part in parts]
         silent = True
         for part in copies:
+            # The number of entries that a run sends
             count = part.size // n_runs
             # A sum of squares is NaN only if an entry is, and takes half as long as np.isnan.
             if part.dtype.kind == "f" and math.isnan(np.vdot(part, part)):
@@ -759,7 +805,10 @@ def _count_payloads(
 
 
 def _copy_part(part: object, agent: int, runs: tuple[int, ...]) -> Part:
-    """Return a read-only copy of an array, or refuse anything else."""
+    """Return a read-only copy of an array, or refuse anything else.
+
+    The part is one of an agent's payload, with the leading axes of the runs.
+    """
     # A masked array's mask, or an object, could carry numbers that are not counted.
     plain = part if isinstance(part, np.ndarray) else None
     if isinstance(part, np.ma.MaskedArray):
@@ -803,7 +852,10 @@ def _mask_part(payload: Part, arrived: Mask) -> Part:
 
 
 def _deliver_everywhere(graph: Graph, sent: Sequence[P | None]) -> list[dict[int, P]]:
-    """Return for each agent the messages of all that it receives from, by sender, ascending."""
+    """Return for each agent the messages of all that it receives from, by sender, ascending.
+
+    The payload of each agent is in `sent`, None for silence.
+    """
     inbox: list[dict[int, P]] = [{} for _ in sent]
     for sender, payload in enumerate(sent):
         if payload is not None:
@@ -815,7 +867,10 @@ def _deliver_everywhere(graph: Graph, sent: Sequence[P | None]) -> list[dict[int
 def _group_by_receiver(
     graph: Graph, sent: Sequence[P], links: Indices
 ) -> list[dict[int, P]]:
-    """Return for each agent the messages on some links, ascending numbers, by sender."""
+    """Return for each agent the messages on some links, ascending numbers, by sender.
+
+    The payload of each agent is in `sent`. The links are those that deliver, (n,).
+    """
     senders = graph.senders[links].tolist()
     # Links are ordered by receiver: agent i has those from bounds[i] to before bounds[i + 1].
     agents = np.arange(graph.n_agents + 1)
@@ -831,9 +886,11 @@ def _weights_after_loss(
 ) -> tuple[Array, Array]:
     """Return self-weights (R, A) and link weights (R, E) of each run after losses.
 
-    `arrived` (R, E) says which links have delivered; the rules are those of :meth:`Channel.mix`.
+    For R runs, A agents and E links, `arrived` (R, E) marks the links that have delivered; the
+    rules are those of :meth:`Channel.mix`.
     """
     receivers = graph.receivers
+    # From a number for each link (R, E) to the sum over the links to each agent, (R, A).
     sum_links = partial(graph._sum_by_receiver, axis=1)
     if on_loss in ("mutual", "metropolis"):
         # A link counts only if its opposite has delivered too.

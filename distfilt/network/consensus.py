@@ -66,6 +66,7 @@ def _warn_if_disconnected(channel: Channel, rounds: int | None = None) -> None:
     if rounds == 1 or channel.expects_parts:
         return
     graph = channel.graph
+    # Agents that are always silent have no links.
     silent = channel.faults.always_silent
     components = _find_components(graph, silent) if silent else graph.components
     count = int(components.max()) + 1
@@ -158,6 +159,7 @@ def average_consensus(
         raise ValueError("gain must be None if weights are given, got both")
     if gain is not None:
         _warn_if_unstable(graph, gain)
+        # The matrix I - γ L
         weights = _laplacian_weights(graph, gain)
     elif weights is None:
         weights = metropolis(graph)
@@ -209,6 +211,7 @@ def finite_time_consensus(values: PerAgent, channel: Channel) -> Array:
     graph._check_connected()
     _check_faultless(channel)
     mixed = values.copy()
+    # The distinct nonzero eigenvalues of the Laplacian
     for eigenvalue in _order_eigenvalues(graph):
         # The factor I - L/λ is an averaging step with the gain 1/λ.
         mixed = channel.mix(mixed, _laplacian_weights(graph, 1 / eigenvalue))
@@ -372,8 +375,12 @@ def _is_usable(weight: Array, rounding: Array) -> Mask:
 
 
 def _warn_if_weights_vanish(usable: Mask) -> None:
-    """Warn of agents that keep an old ratio of push-sum in any run, from (*runs, A, 1)."""
+    """Warn of agents that keep an old ratio of push-sum in any run, from (*runs, A, 1).
+
+    An agent is marked as usable if its weight is more than rounding.
+    """
     n_agents = usable.shape[-2]
+    # Which agents are usable in every run, (A,)
     in_all_runs = usable.reshape(-1, n_agents).all(axis=0)
     if not in_all_runs.all():
         agents = np.flatnonzero(~in_all_runs).tolist()

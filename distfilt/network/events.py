@@ -85,7 +85,8 @@ def event_triggered(
             present, links=~unchanged, acknowledged=faulty, is_broadcast=True
         )
         delivered = np.where(np.isnan(arrived), delivered, arrived)
-        # x̂_j - x̂_i over each link; zero as long as one of the two is missing.
+        # w_ij (x̂_j - x̂_i) over each link; zero as long as one of the two is missing. The incidence
+        # matrix sums them over the links of each agent.
         change = link_weights * (delivered - delivered[graph.reverse])
         x = x + graph.incidence @ np.where(np.isnan(change), 0.0, change)
         # A smaller threshold in the next round, for convergence in the limit.

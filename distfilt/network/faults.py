@@ -118,6 +118,7 @@ class Faults(FrozenModel):
                 f"burst_length must be at least 1 / (1 - loss) = {shortest:g} rounds, the mean "
                 f"length with independent losses, got {self.burst_length:g}"
             )
+        # The dataclass is frozen, so that the field cannot be assigned to.
         if self.during is not None:
             object.__setattr__(self, "during", _check_windows(self.during))
 
@@ -147,6 +148,7 @@ class Faults(FrozenModel):
     def check_graph(self, graph: Graph) -> None:
         """Refuse a graph with another number of agents than `loss` has, or without a silent one."""
         n_agents = graph.n_agents
+        # These faults and all that have been added by ``|``
         for faults in self._flatten():
             # One number, one for each agent, or one for each pair.
             shape = np.shape(faults.loss)
@@ -205,11 +207,13 @@ class Faults(FrozenModel):
         together they cost less time.
         """
         lost = np.zeros((len(rounds), runs, graph.senders.size), dtype=bool)
+        # These faults and all that have been added by ``|``
         for faults in self._flatten():
             if not np.any(faults.loss):
                 continue
             active = [faults._is_active(round_, t) for round_ in rounds]
             if any(active):
+                # Losses (rounds, runs, E), which count in the rounds that lie in a window.
                 draws = faults._draw_rounds(graph, rounds, runs)
                 lost |= draws & np.array(active)[:, None, None]
         return lost
@@ -224,6 +228,7 @@ class Faults(FrozenModel):
     def _draw_rounds(self, graph: Graph, rounds: range, runs: int) -> Mask:
         """Return the losses of some rounds, (rounds, runs, E), as if `during` were always."""
         probability = self._link_probabilities(graph)
+        # A uniform number for each round, run and link, made of random bits of the two
         link_bits = _link_bits(graph)
         uniform = _uniform(self._run_bits(rounds, runs)[:, :, None] ^ link_bits)
         if self.burst_length is None:
@@ -242,7 +247,8 @@ class Faults(FrozenModel):
         # u < enter: lost; enter <= u < enter + stay: as in the round before; otherwise it arrives.
         lost = uniform < enter
         repeats = ~lost & (uniform < enter + stay)
-        # The first round repeats one that is not among these: it is looked up.
+        # Links of the first round that repeat one not among these: it is looked up, and the result
+        # is written into lost[0].
         unknown = np.nonzero(repeats[0])
         self._look_back(lost[0], unknown, rounds[0], link_bits, enter, stay)
         for k in range(1, len(rounds)):
@@ -279,6 +285,7 @@ class Faults(FrozenModel):
         run, link = unknown
         runs = lost.shape[0]
         while run.size:
+            # Uniform numbers (rounds, n) of the rounds before, the latest first
             earlier = range(round_ - 1, round_ - _LOOKBACK - 1, -1)
             round_ = round_ - _LOOKBACK
             uniform = _uniform(self._run_bits(earlier, runs)[:, run] ^ link_bits[link])
@@ -316,6 +323,7 @@ def _check_windows(during: object) -> tuple[tuple[float, float], ...]:
 
     An end may be infinite; a NaN fails the comparison and is refused.
     """
+    # A row (start, stop) for each window
     ends = check_array(during, "during", finite=False)
     if ends.ndim != 2 or ends.shape[1] != 2 or not (ends[:, 0] < ends[:, 1]).all():
         raise ValueError(

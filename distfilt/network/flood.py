@@ -67,6 +67,7 @@ def flooding(
     table = np.concatenate([numbers, values], axis=1)
     known = np.eye(n_agents, dtype=bool)
     new = known
+    # The number of each link's opposite link, or of the last row below where there is none.
     opposite = find_opposite(graph)
     # Which values (columns) have come over which link (rows). The additional last row, always
     # false, serves links without an opposite.
@@ -81,10 +82,14 @@ def flooding(
         # By broadcast an agent sends each value once that it sends on any of its links.
         on_any_link = np.zeros_like(known)
         np.logical_or.at(on_any_link, graph.senders, outgoing)
-        payloads = [table[rows] if rows.any() else None for rows in outgoing]
-        common = [table[rows] if rows.any() else None for rows in on_any_link]
+        # Each link's values to send, and, for the bill, each agent's on all its links. None is no
+        # message.
+        payloads = [table[sent] if sent.any() else None for sent in outgoing]
+        common = [table[sent] if sent.any() else None for sent in on_any_link]
         received = np.zeros_like(known)
         for link, rows in enumerate(channel.unicast(payloads, common=common)):
+            # The rows of the table that have arrived: numbers of agents, and their values, which
+            # `values` has anyway.
             if rows is not None:
                 came_over[link, rows[:, 0].astype(int)] = True
                 received[graph.receivers[link]] |= came_over[link]

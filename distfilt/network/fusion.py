@@ -137,15 +137,19 @@ def _intersect(
 ) -> Pair:
     """Fuse Gaussians by covariance intersection, without checks.
 
-    `periods` has an entry for each component of the belief; () if none is circular.
+    `periods` has an entry for each component of the belief; () if none is circular. The rule names
+    the weights; an exchange takes place in each of the rounds.
     """
 
     def fuse(received: _Received) -> Pair:
+        # Where known constants are left out of the exchange, `received` has the periods of the
+        # other components already.
         if len(periods) == received.means.shape[-1]:
             received.periods = periods
         self_weights, link_weights = _intersection_weights(received, rule)
         return _sum_information(received, self_weights, link_weights)
 
+    # An exchange of Gaussians in each round, and then their fusion
     return _repeat(belief, channel, rounds, fuse)
 
 
@@ -207,6 +211,8 @@ def arithmetic_average(
 
     def fuse(received: _Received) -> Pair:
         graph = received.graph
+        # Equal weights of the own Gaussian and of those received, (R, A) and (R, E), and the
+        # differences m_j - m_i, (R, E, d), which are summed over each agent's links
         self_weights, link_weights = _intersection_weights(received, "equal")
         difference = received.mean_differences()
         shift = graph._sum_by_receiver(link_weights[..., None] * difference, axis=1)
@@ -216,6 +222,7 @@ def arithmetic_average(
         weighted = link_weights[..., None, None] * deviation[..., :, None]
         squares = weighted * deviation[..., None, :]
         spread = graph._sum_by_receiver(squares, axis=1)
+        # The own mean's part, s sᵀ
         weighted = self_weights[..., None, None] * shift[..., :, None]
         spread += weighted * shift[..., None, :]
         covs = received.sum_matrices(self_weights, link_weights, received.covs)
@@ -270,6 +277,7 @@ def consensus_pull(
     if rounds > 1:
         _warn_if_disconnected(channel)
     means, covs = belief
+    # The weights of the matrix I - γ L; means of angles are mixed by their differences, which wrap.
     weights = _laplacian_weights(channel.graph, gain)
     if channel.periods:
         for _ in range(rounds):
@@ -331,6 +339,7 @@ def mean_pull(
     _warn_if_unstable(channel.graph, gain)
     if rounds > 1:
         _warn_if_disconnected(channel)
+    # The weights of the matrix I - γ L; means of angles are mixed by their differences, which wrap.
     weights = _laplacian_weights(channel.graph, gain)
     for _ in range(rounds):
         means = pulled.mean(axis=-2)
@@ -386,6 +395,7 @@ def intersect_ensembles(
     """
     if rounds > 1:
         _warn_if_disconnected(channel)
+    _check_members(ensembles.shape[-2], 1)
     unit = 1.0 if scale is None else scale
     x = ensembles / unit
     means = mean(x)
@@ -393,9 +403,12 @@ def intersect_ensembles(
     periods = channel.periods
     if scale is not None:
         periods = _scale_periods(periods, scale)
-    is_known = _find_known(means, covs)
+    # Components that are the same constant for all members of all agents, (d,)
+    is_known = find_known(means, covs, periods, "ensembles")
+    _check_members(ensembles.shape[-2], int((~is_known).sum()))
     if not np.count_nonzero(is_known):
         fuse = partial(_intersect, rule=rule, rounds=rounds, periods=periods)
+        # The affine map of each ensemble to the fused mean and covariance
         return _move_members(x, (means, covs), channel, fuse) * unit
     # A constant that all agents know stays, and is not sent.
     rest = ~is_known
@@ -410,7 +423,12 @@ def intersect_ensembles(
 def _move_members(
     x: Array, belief: Pair, channel: Channel, fuse: Callable[[Pair, Channel], Pair]
 ) -> Array:
-    """Move ensembles by the affine map from their sample moments to the fused ones."""
+    """Move ensembles by the affine map from their sample moments to the fused ones.
+
+    Ensembles x are (..., A, N, d), `belief` has their sample means and covariances, and `fuse`
+    fuses those over the channel.
+    """
+    # Each ensemble gets the fused mean and covariance of its agent.
     try:
         return match_moments(x, *fuse(belief, channel))
     except ValueError:
@@ -419,15 +437,26 @@ def _move_members(
         raise
 
 
-def _find_known(means: Array, covs: Array) -> Mask:
-    """Return which components are constants that the members of all agents agree on, (d,).
+def _check_members(n_members: int, n_components: int) -> None:
+    """Refuse ensembles whose sample covariances are singular because they are small."""
+    if n_members <= n_components:
+        raise ValueError(
+            "ensembles must have more members than components that vary, to be fused by their "
+            f"covariances, got {n_members} members of {n_components} components"
+        )
+
+
+def find_known(means: Array, covs: Array, periods: Periods, name: str) -> Mask:
+    """Return which components are constants that all agents agree on, (d,).
+
+    Means are (..., A, d), covariances (..., A, d, d); `name` is that of the argument.
 
     >>> means = np.ones((2, 2))
-    >>> _find_known(means, np.array([np.diag([1.0, 0.0])] * 2))
+    >>> find_known(means, np.array([np.diag([1.0, 0.0])] * 2), (), "belief")
     array([False,  True])
-    >>> _find_known(means + [[0.0], [1.0]], np.zeros((2, 2, 2)))
+    >>> find_known(means + [[0.0], [1.0]], np.zeros((2, 2, 2)), (), "belief")
     Traceback (most recent call last):
-    ValueError: ensembles must have equal means where no agent has a variance, got means ...
+    ValueError: belief must have equal means where no agent has a variance, got means that ...
     """
     # Members that are all equal vary by rounding alone: by a few units of it, from the sum.
     rounding = 16 * EPS * np.abs(means)
@@ -435,11 +464,13 @@ def _find_known(means: Array, covs: Array) -> Mask:
     by_component = np.asarray(is_known.reshape(-1, means.shape[-1]).all(axis=0))
     if not np.count_nonzero(by_component):
         return by_component
-    differs = np.ptp(means, axis=-2) > rounding.max(axis=-2)
+    # Angles may differ by whole turns.
+    differences = np.abs(wrap_differences(means - means[..., :1, :], periods))
+    differs = differences > rounding.max(axis=-2, keepdims=True)
     if (differs & by_component).any():
         raise ValueError(
-            "ensembles must have equal means where no agent has a variance, got means that "
-            f"differ by up to {np.ptp(means, axis=-2)[..., by_component].max():g}"
+            f"{name} must have equal means where no agent has a variance, got means that "
+            f"differ by up to {differences[..., by_component].max():g}"
         )
     return by_component
 
@@ -459,11 +490,13 @@ def _mix_circular(
     """
     graph = channel.graph
     d = means.shape[-1]
+    # All runs in one axis, (R, A, d); then which messages of d numbers arrive, (R, E).
     flat = means.reshape(-1, graph.n_agents, d)
     arrived = channel._transmit_numbers(d)
     difference = flat[:, graph.senders] - flat[:, graph.receivers]
     difference = wrap_differences(difference, channel.periods)
     link_weights = weights.link_weights * arrived
+    # Sums over the links to each agent
     shift = graph._sum_by_receiver(link_weights[..., None] * difference, axis=1)
     self_weights = 1.0 - graph._sum_by_receiver(link_weights, axis=1)
     runs = means.shape[:-2]
@@ -488,6 +521,7 @@ class _Received:
         self, self_weights: Array, link_weights: Array, matrices: Array
     ) -> Array:
         """Return weighted sums of each agent's matrix, of (R, A, d, d), and the received ones."""
+        # Weights (R, A) and (R, E) broadcast over the matrices' own axes.
         sent = link_weights[..., None, None] * matrices[:, self.graph.senders]
         own_part = self_weights[..., None, None] * matrices
         return own_part + self.graph._sum_by_receiver(sent, axis=1)
@@ -528,7 +562,7 @@ def _repeat_uncertain(
 ) -> Pair:
     """Do as `_repeat` with the components that have a variance; the others are known constants.
 
-    `is_uncertain` (d,) says which components those are.
+    `is_uncertain` (d,) says which components those are. The other arguments are those of `_repeat`.
     """
     means, covs = belief
     known = means[..., ~is_uncertain]
@@ -540,7 +574,9 @@ def _repeat_uncertain(
     new_means = means.copy()
     new_covs = covs.copy()
     if is_uncertain.any():
+        # The rows and columns of these components in the covariances
         rows, columns = np.ix_(is_uncertain, is_uncertain)
+        # The same exchange and fusion, of these components alone
         periods = _select_periods(channel.periods, is_uncertain)
         part = (means[..., is_uncertain], covs[..., rows, columns])
         part = _repeat_all(part, channel, rounds, fuse, periods)
@@ -561,15 +597,20 @@ def _repeat_all(
     fuse: Callable[[_Received], Pair],
     periods: Periods,
 ) -> Pair:
-    """Do as `_repeat` with Gaussians all of whose components have a variance."""
+    """Do as `_repeat` with Gaussians all of whose components have a variance.
+
+    The periods are those of these components.
+    """
     means, covs = belief
     graph = channel.graph
     d = means.shape[-1]
+    # A mean and the upper triangle of a covariance
     numbers = d + d * (d + 1) // 2
     # All runs in one axis.
     flat_means = means.reshape(-1, graph.n_agents, d)
     flat_covs = covs.reshape(-1, graph.n_agents, d, d)
     for _ in range(rounds):
+        # Which messages arrive, (R, E)
         arrived = channel._transmit_numbers(numbers)
         received = _Received(graph, flat_means, flat_covs, arrived, periods)
         flat_means, flat_covs = fuse(received)
@@ -577,7 +618,10 @@ def _repeat_all(
 
 
 def _intersection_weights(received: _Received, rule: Rule) -> Pair:
-    """Return self-weights (R, A) and link weights (R, E) that sum to one for each agent."""
+    """Return self-weights (R, A) and link weights (R, E) that sum to one for each agent.
+
+    The runs are R, the agents A and the links E; a message that has not arrived has no weight.
+    """
     if rule.startswith("min"):
         return _optimal_weights(received, rule)
     graph = received.graph
@@ -602,20 +646,24 @@ def _intersection_weights(received: _Received, rule: Rule) -> Pair:
 
 
 def _optimal_weights(received: _Received, rule: Rule) -> Pair:
-    """Return the weights of the smallest result, for all agents of equal degree at once."""
+    """Return the weights of the smallest result, for all agents of equal degree at once.
+
+    They are self-weights (R, A) and link weights (R, E), of R runs, A agents and E links.
+    """
     graph = received.graph
     unit = np.eye(received.means.shape[-1])
     self_weights = np.ones(received.means.shape[:2])
     link_weights = np.zeros(received.arrived.shape)
+    # Agents with as many neighbours have as many covariances to weight.
     for degree in np.unique(graph.in_degree):
         agents = np.flatnonzero(graph.in_degree == degree)
-        # The links of these agents, (agents, degree), which are neighbours in the order
-        # of links.
+        # The links of these agents, (agents, degree): those to agent i begin at indptr[i].
         links = graph.links.indptr[agents, None] + np.arange(int(degree))
         arrived = received.arrived[:, links]
         sent = received.covs[:, graph.senders[links]]
         # A unit matrix stands for a lost covariance, which gets no weight.
         sent = np.where(arrived[..., None, None], sent, unit)
+        # The agent's own covariance comes first, and is always present.
         covs = np.concatenate([received.covs[:, agents, None], sent], axis=2)
         present = np.insert(arrived, 0, True, axis=2)
         omega = intersection_weights(covs, rule=rule, present=present)
@@ -627,12 +675,17 @@ def _optimal_weights(received: _Received, rule: Rule) -> Pair:
 def _sum_information(
     received: _Received, self_weights: Array, link_weights: Array
 ) -> Pair:
-    """Return mean and covariance of weighted sums of information matrices and vectors."""
+    """Return mean and covariance of weighted sums of information matrices and vectors.
+
+    For R runs, A agents and E links the weights are (R, A) and (R, E). An information matrix is an
+    inverse covariance, P⁻¹, and its vector P⁻¹ m.
+    """
     graph = received.graph
     d = received.means.shape[-1]
+    # P_j⁻¹ of each agent, (R, A, d, d)
     information = _invert(received.covs)
-    # m = m_i + P Σ_j ω_j P_j⁻¹ (m_j - m_i): about the own mean, so that equal means
-    # stay and large ones lose no digits.
+    # P⁻¹ = Σ_j ω_j P_j⁻¹ and m = m_i + P Σ_j ω_j P_j⁻¹ (m_j - m_i): about the own mean, so that
+    # equal means stay and large ones lose no digits. First for each link, by its sender.
     of_sender = information.take(graph.senders, axis=1)
     pull = of_sender @ received.mean_differences()[..., None]
     # One sum over the links for ω_j P_j⁻¹ and, as a further column, for the pull.
@@ -646,7 +699,10 @@ def _sum_information(
 
 
 def _invert(spd: Array) -> Array:
-    """Return inverses of positive definite matrices, symmetric up to rounding."""
+    """Return inverses of positive definite matrices, symmetric up to rounding.
+
+    The matrices are (..., d, d).
+    """
     d = spd.shape[-1]
     n = math.prod(spd.shape[:-2])
     if n > 2 * d:

@@ -84,6 +84,8 @@ def gossip_consensus(
         # If the agent has no neighbours nothing happens in this round.
         if graph.in_degree[agent] == 0:
             continue
+        # Links are ordered by receiver: those to the agent begin at indptr. The pair is the link
+        # from the neighbour and its opposite, to the neighbour.
         link = int(graph.links.indptr[agent]) + choice
         pair = [link, int(graph.reverse[link])]
         ends = graph.receivers[pair]

@@ -62,7 +62,8 @@ class Graph(FrozenModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        # Checked and with sorted columns, on which the order of links depends.
+        # Checked and with sorted columns, on which the order of links depends. The dataclass is
+        # frozen, so that the field cannot be assigned to.
         links = _links.from_matrix(self.links, "links", directed=True)
         object.__setattr__(self, "links", links)
 
@@ -180,15 +181,21 @@ class Graph(FrozenModel):
         return scipy.sparse.csr_array(entries, (self.n_agents, n_links))
 
     def _sum_by_receiver(self, per_link: Array, axis: int = -2) -> Array:
-        """Return sums over each agent's links: E entries along an axis become A."""
+        """Return sums over each agent's links: E entries along an axis become A.
+
+        Entry e along this axis belongs to link e of E, entry i of the result to agent i of A.
+        """
         if 0 < self._degree <= _FEW_LINKS:
-            # As many links end at each agent, in the order of the agents: term by term.
+            # On a regular graph, in which the same number of links, the degree, ends at each agent,
+            # links are in the order of the receivers: an axis of agents and one of terms, which are
+            # added one by one. The axes before and behind that of the links become one each.
             axis %= per_link.ndim
             before = per_link.shape[:axis]
             behind = per_link.shape[axis + 1 :]
             n = self.n_agents
             lead = math.prod(before)
             by_agent = per_link.reshape(lead, n, self._degree, math.prod(behind))
+            # A new array, and a sum from zero, as the sparse product's below.
             total = 0.0 + by_agent[:, :, 0]
             for k in range(1, self._degree):
                 total += by_agent[:, :, k]
@@ -204,6 +211,7 @@ class Graph(FrozenModel):
     def neighbours(self, agent: NonNegativeInt) -> tuple[int, ...]:
         """Return the agents that `agent` receives from, ascending, without itself."""
         Bounds(below=self.n_agents)(agent, "agent")
+        # Row i of the sparse matrix has the senders of the links to agent i.
         start = self.links.indptr[agent]
         stop = self.links.indptr[agent + 1]
         return tuple(self.links.indices[start:stop].tolist())
@@ -233,6 +241,7 @@ class Graph(FrozenModel):
     def _every_link(self) -> Mask:
         """True for each link, (E,), read-only."""
         links = np.ones(self.senders.size, dtype=bool)
+        # All callers share the cached array.
         links.setflags(write=False)
         return links
 
@@ -261,6 +270,7 @@ class Graph(FrozenModel):
         """What each agent sends if a round has so many floats on every link.
 
         Messages, scalars and bytes by link, then transmissions, scalars and bytes by broadcast.
+        Each is (A,); a float has eight bytes.
         """
         if numbers not in self._bills:
             bills = []
@@ -330,6 +340,7 @@ class Graph(FrozenModel):
         # A fixed seed makes results repeatable; a random vector has a part along every
         # eigenvector.
         start = np.random.default_rng(0).standard_normal(self.n_agents)
+        # One eigenvalue, the largest ("LA"), without its vector, to eight digits
         try:
             largest = eigsh(
                 self.laplacian,
@@ -438,6 +449,7 @@ def as_graph(
     elif _links.is_networkx(value):
         graph = Graph.from_networkx(value, names)
     elif scipy.sparse.issparse(value) or isinstance(value, np.ndarray | list | tuple):
+        # Edges between names become edges between numbers; a matrix stays as it is.
         edges = _links.number_edges(value, names, "graph")
         graph = Graph.construct(_links.from_either(edges, n_agents, "graph"))
     else:

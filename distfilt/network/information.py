@@ -11,7 +11,7 @@ from ..periods import fold
 from ..validation import Array, PositiveInt, call_user, check_array, validated
 from .channel import Channel, LossRule, fusion_rule
 from .consensus import _warn_if_disconnected, average_consensus
-from .fusion import Gaussians, Pair, _invert, _mix_circular
+from .fusion import Gaussians, Pair, _invert, _mix_circular, find_known
 from .graphs import Graph
 from .weights import (
     ConsensusWeights,
@@ -67,8 +67,8 @@ def information_consensus(
     means, covs = belief
     # All agents' angles on one branch
     means = fold(means, channel.periods)
+    # P⁻¹ and P⁻¹ m, packed in vectors of d(d+1)/2 + d numbers, which the user's rule averages
     numbers = pack_information(*to_information(means, covs))
-    # The rule is the user's, and mixes vectors of d(d+1)/2 + d numbers.
     averaged = call_user(consensus, numbers, channel)
     averaged = check_array(averaged, "consensus", numbers.shape)
     return from_information(*unpack_information(averaged, means.shape[-1]))
@@ -126,6 +126,9 @@ def diffuse_means(
     if rounds > 1:
         _warn_if_disconnected(channel)
     means, covs = belief
+    # Constants that differ would lose what every agent is certain of.
+    find_known(means, covs, channel.periods, "belief")
+    # Means on a line are mixed by the weights.
     if not channel.periods:
         means = channel.mix(means, weights, on_loss=on_loss, rounds=rounds)
         return means, covs.copy()
@@ -142,6 +145,7 @@ def diffuse_means(
 def _check_convex(weights: ConsensusWeights, graph: Graph) -> None:
     """Refuse weights of another graph, negative ones, and rows that do not sum to one."""
     _check_same_links(weights, graph)
+    # The smallest weight of all, at most zero.
     least = min(weights.self_weights.min(), weights.link_weights.min(initial=0.0))
     if least < 0:
         raise ValueError(f"weights must be nonnegative, got {least:g}")
@@ -168,6 +172,7 @@ def pack_information(matrix: Array, vector: Array) -> Array:
     >>> pack_information(np.array([[1.0, 2.0], [2.0, 5.0]]), np.array([7.0, 8.0]))
     array([1., 2., 5., 7., 8.])
     """
+    # The matrices are symmetric.
     rows, columns = np.triu_indices(matrix.shape[-1])
     return np.concatenate([matrix[..., rows, columns], vector], axis=-1)
 

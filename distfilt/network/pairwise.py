@@ -203,7 +203,7 @@ def split_covariance_intersection(
         if round_ > 0:
             # A part that has been sent is no longer independent.
             parts = [parts[0], parts[1] + parts[2], 0 * parts[2]]
-        # A mean, and the upper triangles of two covariances
+        # Which messages arrive, (R, E): a mean, and the upper triangles of two covariances each
         arrived = channel._transmit_numbers(d + d * (d + 1))
         parts = _fuse_parts(parts, channel, arrived, rule)
     x, dependent_part, independent_part = parts
@@ -220,7 +220,7 @@ def _fuse_parts(
     """Fuse each agent's Gaussian with those that have arrived, (R, E), one by one.
 
     `parts` and the result are the means (R, A, d), and the dependent and the independent parts of
-    the covariances, (R, A, d, d).
+    the covariances, (R, A, d, d). The rule says which size of a fused covariance is made smallest.
     """
     graph = channel.graph
     fused = [part.copy() for part in parts]
@@ -247,6 +247,7 @@ def _iterate_neighbours(graph: Graph) -> Iterator[tuple[Indices, Indices]]:
     Neighbours are ordered by number, from n = 0. All agents fuse their n-th one at once.
     """
     for turn in range(int(graph.in_degree.max(initial=0))):
+        # The links to agent i begin at indptr[i], in the order of the senders.
         agents = np.flatnonzero(graph.in_degree > turn)
         yield agents, graph.links.indptr[agents] + turn
 
@@ -263,13 +264,17 @@ def _repeat_in_turn(
 
 
 def _fuse_in_turn(received: _Received, pair_rule: PairRule) -> Pair:
-    """Fuse each agent's Gaussian with the received ones, in the order of their senders."""
+    """Fuse each agent's Gaussian with the received ones, in the order of their senders.
+
+    `pair_rule` fuses two Gaussians.
+    """
     graph = received.graph
     means = received.means.copy()
     covs = received.covs.copy()
     # In turn n each agent that has an n-th neighbour receives from it, over one link.
     for agents, links in _iterate_neighbours(graph):
         senders = graph.senders[links]
+        # The agents' results so far
         own_mean = means[:, agents]
         own_cov = covs[:, agents]
         # On the receiver's branch of circular components

@@ -120,7 +120,10 @@ def _stable_step(largest: float, alpha: float, a: float, b: float) -> float:
 def _warn_if_unstable_step(
     channel: Channel, h: float, alpha: float, a: float, b: float
 ) -> None:
-    """Warn the user of substeps with which the estimates diverge on this graph."""
+    """Warn the user of substeps with which the estimates diverge on this graph.
+
+    The substeps are h, in s, and the gains α, a and b, in 1/s, those of :func:`pi_step`.
+    """
     graph = channel.graph
     # Most steps are below a bound from the degrees, which costs no eigenvalues.
     if h <= _stable_step(2 / graph.degree_bound_gain, alpha, a, b):
@@ -203,8 +206,8 @@ def pi_step(
         )
     nu = state.estimate
     eta = state.integral
+    # The derivative u' of the inputs, and the number of Euler steps.
     slope: Array | float = 0.0 if rate is None else rate
-    # The derivative of the inputs, and the number of Euler steps.
     n = substeps or stable_substeps(channel, dt, alpha=alpha, a=a, b=b)
     if substeps is not None:
         _warn_if_unstable_step(channel, dt / substeps, alpha, a, b)

@@ -76,10 +76,11 @@ def fuse_on_tree(
     n_links = graph.senders.size
     m = means.reshape(-1, graph.n_agents, d)
     link_mean = common_means.reshape(-1, n_links, d)
-    # Information matrices of agents and links
+    # Information matrices of agents, (R, A, d, d), and of links, (R, E, d, d), for R runs
     y = _invert(covs.reshape(-1, graph.n_agents, d, d))
     link_y = _invert(common_covs.reshape(-1, n_links, d, d))
     faulty = not channel.faults.is_perfect
+    # Which messages arrive, (R, E): a mean and the upper triangle of a covariance each
     arrived = channel._transmit_numbers(d + d * (d + 1) // 2, acknowledged=faulty)
     # Both ends add the other one's information, or neither does.
     is_mutual = (arrived & arrived[:, graph.reverse])[..., None, None]
@@ -89,10 +90,12 @@ def fuse_on_tree(
     y_j = y[:, graph.senders]
     y_i = y[:, graph.receivers]
     own = m[:, graph.receivers]
+    # Differences m_j - m_i and m_ij - m_i of means, of angles the shorter way round
     other = _subtract(m[:, graph.senders], own, channel)
     shared = _subtract(link_mean, own, channel)
     gained = np.where(is_mutual, y_j - link_y, 0.0)
     pull = np.where(is_mutual, y_j @ other[..., None] - link_y @ shared[..., None], 0.0)
+    # The sums run over each agent's links.
     new_cov = _invert(y + graph._sum_by_receiver(gained, axis=1))
     shift = new_cov @ graph._sum_by_receiver(pull, axis=1)
     fused_mean = (m + shift[..., 0]).reshape(means.shape)
@@ -110,7 +113,10 @@ def fuse_on_tree(
 
 
 def _subtract(first: Array, second: Array, channel: Channel) -> Array:
-    """Return a difference of means, of angles the shorter way round."""
+    """Return a difference of means, of angles the shorter way round.
+
+    The channel has the periods of the means' components, if any is circular.
+    """
     difference = first - second
     if channel.periods:
         return wrap_differences(difference, channel.periods)
@@ -121,6 +127,7 @@ def _check_tree(graph: Graph) -> None:
     """Refuse a graph with a circle, around which information would come back as new."""
     graph._check_undirected()
     n_parts = int(graph.components.max()) + 1
+    # An edge is a link both ways. A forest of n trees has n edges fewer than agents.
     n_edges = graph.senders.size // 2
     if n_edges != graph.n_agents - n_parts:
         raise ValueError(

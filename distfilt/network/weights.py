@@ -147,6 +147,7 @@ def interleave_weights(graph: Graph, self_weights: Array, link_weights: Array) -
 
 def _check_same_links(weights: ConsensusWeights, graph: Graph) -> None:
     """Refuse weights of another graph's links."""
+    # Two sparse matrices (A, A) have the same entries if their row starts and columns are equal.
     links = graph.links
     of_weights = weights.graph.links
     if np.array_equal(links.indptr, of_weights.indptr) and np.array_equal(
@@ -185,6 +186,7 @@ def metropolis(graph: Graph) -> ConsensusWeights:
     graph._check_undirected()
     degree = graph.in_degree
     larger = np.maximum(degree[graph.receivers], degree[graph.senders])
+    # With self-weights that make each row sum to one
     return _add_self_weights(graph, 1 / (1 + larger))
 
 
@@ -287,6 +289,7 @@ def fastest_mixing(graph: Graph) -> ConsensusWeights:
     # Each solution starts the next, less smooth problem. The smooth function exceeds the largest
     # modulus by at most μ log 2A, which the last μ makes less than 1e-3.
     for mu in (1e-1, 1e-2, 1e-3, 1e-4):
+        # `jac=True`: the function returns its gradient too.
         solution = minimize(
             _smooth_modulus,
             solutions[-1],
@@ -308,17 +311,25 @@ def fastest_mixing(graph: Graph) -> ConsensusWeights:
 def _symmetric_weights(
     graph: Graph, forward: Indices, pair_weights: Array
 ) -> ConsensusWeights:
-    """Return weights that are equal on opposite links."""
+    """Return weights that are equal on opposite links.
+
+    `forward` are one link of each pair of opposite ones, `pair_weights` the weights of the pairs.
+    """
     link_weights = np.empty(graph.senders.size)
     link_weights[forward] = pair_weights
     link_weights[graph.reverse[forward]] = pair_weights
+    # With self-weights that make each row sum to one
     return _add_self_weights(graph, link_weights)
 
 
 def _decompose(
     graph: Graph, forward: Indices, pair_weights: Array
 ) -> tuple[Array, Array]:
-    """Return eigenvalues and eigenvectors of W - 11ᵀ/A, which has no eigenvalue of the average."""
+    """Return eigenvalues and eigenvectors of W - 11ᵀ/A, which has no eigenvalue of the average.
+
+    `forward` are the links of which one of each pair of opposite ones is taken, `pair_weights` the
+    weights of these pairs.
+    """
     weights = _symmetric_weights(graph, forward, pair_weights)
     return np.linalg.eigh(weights.matrix.toarray() - 1 / graph.n_agents)
 
@@ -326,7 +337,10 @@ def _decompose(
 def _smooth_modulus(
     pair_weights: Array, graph: Graph, forward: Indices, mu: float
 ) -> tuple[float, Array]:
-    """Return the smoothed largest modulus of the eigenvalues, and its gradient."""
+    """Return the smoothed largest modulus of the eigenvalues, and its gradient.
+
+    The arguments are those of :func:`_decompose`; μ is the width of the smoothing.
+    """
     values, vectors = _decompose(graph, forward, pair_weights)
     # μ log Σ_k (exp(λ_k/μ) + exp(-λ_k/μ)), scaled by the largest term.
     largest = np.abs(values).max()
@@ -334,7 +348,7 @@ def _smooth_modulus(
     negative = np.exp((-values - largest) / mu)
     total = positive.sum() + negative.sum()
     modulus = float(largest + mu * np.log(total))
-    # The derivative in the matrix is G = Σ_k g_k v_k v_kᵀ.
+    # The derivative in the matrix is G = Σ_k g_k v_k v_kᵀ, with g_k that in the eigenvalue λ_k.
     derivative = (vectors * ((positive - negative) / total)) @ vectors.T
     # The weight of a pair (i, j) enters W as -(e_i - e_j)(e_i - e_j)ᵀ.
     i = graph.receivers[forward]
@@ -396,17 +410,22 @@ def doubly_stochastic(graph: Graph) -> ConsensusWeights:
     array([1., 1., 1.])
     """
     graph._check_connected()
+    # The vector p with pᵀ L = 0
     if graph.is_directed:
         p = _left_null_vector(graph.laplacian)
     else:
         p = np.ones(graph.n_agents)
-    # With this scale the smallest self-weight is 1/2, that of the largest scaled degree.
+    # With self-weights that make each row sum to one. With this scale the smallest of them is 1/2,
+    # that of the largest scaled degree.
     link_weights = p[graph.receivers] / (2 * (p * graph.in_degree).max())
     return _add_self_weights(graph, link_weights)
 
 
 def _left_null_vector(laplacian: scipy.sparse.csr_array) -> Array:
-    """Return the positive p with pᵀ L = 0 of a strongly connected graph, largest entry 1."""
+    """Return the positive p with pᵀ L = 0 of a strongly connected graph, largest entry 1.
+
+    The Laplacian L is (A, A), and p is (A,).
+    """
     from scipy.sparse.linalg import splu
 
     # With p_0 = 1, the other rows of Lᵀ p = 0 are a system whose matrix is an M-matrix: its LU
@@ -414,6 +433,7 @@ def _left_null_vector(laplacian: scipy.sparse.csr_array) -> Array:
     transposed = laplacian.T.tocsc()
     matrix = transposed[1:, 1:]
     right = -transposed[1:, [0]].toarray().ravel()
+    # An order of columns for symmetric patterns, and the diagonal as pivots
     factor = splu(
         matrix,
         permc_spec="MMD_AT_PLUS_A",
@@ -445,6 +465,7 @@ def _check_keeps_average(weights: ConsensusWeights) -> None:
 def _warn_if_not_converging(weights: ConsensusWeights, rounds: int) -> None:
     """Warn the user of weights with which the agents' differences grow, or do not shrink."""
     graph = weights.graph
+    # With positive weights averaging converges.
     if _has_positive_weights(weights):
         return
     # The factor by which a round multiplies the slowest mode of differences.
@@ -479,6 +500,7 @@ def _is_periodic(weights: ConsensusWeights) -> bool:
     """
     if (weights.self_weights < 0).any() or (weights.link_weights < 0).any():
         return False
+    # Entries that are zero are no links.
     twice = weights.matrix @ weights.matrix
     twice.eliminate_zeros()
     n_components, _labels = scipy.sparse.csgraph.connected_components(
@@ -530,6 +552,7 @@ def _check_sums_to_one(
     error = np.abs(sums - 1) / np.maximum(1.0, scale)
     worst = int(error.argmax())
     if error[worst] > 1e-9:
+        # A small error is shown by its size: six digits of the sum would read 1.
         got = f"{sums[worst]:.6g}"
         if error[worst] < 1e-6:
             got = f"one that is {error[worst]:.1e} off, as after single precision,"

@@ -224,6 +224,41 @@ def test_ensembles_are_intersected_beside_a_constant(rule: Any, scale: Any) -> N
         network.intersect_ensembles(long, channel)
 
 
+@pytest.mark.parametrize("turns", [0, 1])
+def test_a_constant_heading_is_known_in_every_turn(turns: int) -> None:
+    """Agents may write one heading with different numbers of turns; others contradict."""
+    period = 2 * np.pi
+    heading = 3.0 + np.array([0.0, turns]) * period
+    covs = np.array([np.diag([1.0, 0.0]), np.diag([4.0, 0.0])])
+    means = np.stack([np.array([0.0, 6.0]), heading], axis=-1)
+    channel = Channel(graphs.path(2))
+    channel.periods = (None, period)
+    moved, _covs = network.diffuse_means((means, covs), channel)
+    # Metropolis weights of two agents are equal.
+    assert np.allclose(moved[:, 0], 3.0)
+    turned = np.exp(1j * moved[:, 1])
+    assert np.allclose(turned, np.exp(3j), atol=1e-12)
+    means[1, 1] += 0.5
+    with pytest.raises(ValueError, match="equal means where no agent has a variance"):
+        network.diffuse_means((means, covs), channel)
+
+
+def test_small_ensembles_are_refused_by_their_size() -> None:
+    """N - 1 anomalies span a space of N - 1 components; a constant needs none."""
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((2, 3, 3))
+    channel = Channel(graphs.path(2))
+    with pytest.raises(ValueError, match="got 3 members of 3 components"):
+        network.intersect_ensembles(x, channel)
+    with pytest.raises(ValueError, match="got 1 members of"):
+        network.intersect_ensembles(x[:, :1], channel)
+    x[..., 2] = 0.7
+    fused = network.intersect_ensembles(x, channel)
+    assert np.allclose(fused[..., 2], 0.7)
+    plain = network.intersect_ensembles(x[..., :2], channel)
+    assert np.allclose(fused[..., :2], plain)
+
+
 def test_networks_of_exact_ensembles_know_a_constant() -> None:
     make = partial(filters.EnsembleFilter.exact, graph=graphs.path(2), members=40)
     f = make(LONG_WALK, [LINEAR_BIASED] * 2)

@@ -518,6 +518,27 @@ def test_a_copy_with_a_rounded_time_is_told(family: str, gap: float) -> None:
 
 
 @EACH
+@pytest.mark.parametrize("later", [1.1 + 1e-9, float(np.float32(1.1)), 1.100004])
+def test_a_copy_with_a_rounded_time_in_other_ways(family: str, later: float) -> None:
+    """Arrays know how far apart the times usually are, single steps only two of them."""
+    f = FAMILIES[family](WALK, [EYE])
+    times = [1.1, later, 2.0, 3.0]
+    values = np.array([[0.3], [0.3], [0.5], [0.6]])
+    message = "must have one time to count once"
+    with pytest.warns(RuntimeWarning, match=message):
+        f.run(start_of(f), times, [values])
+    with pytest.warns(RuntimeWarning, match=message):
+        state = f.step(start_of(f), times[0], [values[0]])
+        f.step(state, times[1], [values[1]])
+    # Another value, one that is missing, or a longer time between: nothing is said.
+    with warnings.catch_warnings(action="error"):
+        f.run(start_of(f), times, [values + [[0.0], [0.1], [0.0], [0.0]]])
+        f.step(state, times[1], [values[1] + 0.1])
+        f.step(state, 1.2, [values[1]])
+        f.step(f.step(start_of(f), 1.1, [[np.nan]]), later, [[np.nan]])
+
+
+@EACH
 def test_times_in_another_unit_are_told(family: str) -> None:
     f = FAMILIES[family](WALK, [EYE])
     for unit, factor in {"nano": 1e9, "micro": 1e6, "milli": 1e3}.items():
