@@ -1,4 +1,4 @@
-"""What chapter 9 says about its stored runs, and the density of its four agents."""
+"""What chapter 9b says about its stored runs, and the density of chapter 9's four agents."""
 
 from __future__ import annotations
 
