@@ -158,12 +158,15 @@ def difference_with_error(
     """Derivative as :func:`central_difference`, and a bound of its rounding error, (..., m, d)."""
     size = np.maximum(1.0, np.abs(x))
     deviation = size if scale is None else np.broadcast_to(scale, x.shape)
+    # Slopes of the given step, or of shorter ones where the function bends within it.
     refined = _refine_differences(function, x, difference, step)
     first = refined.first
+    # The function may turn many times within a step that is longer than the deviation.
     is_long = (first.step > deviation) & (deviation > 0)
     if scale is not None and is_long.any():
         slope = _shorten_steps(function, x, difference, first, refined.slope, deviation)
         refined = refined._replace(slope=slope)
+    # Rounding of the function's values counts less over longer steps.
     if _may_be_noisy(first, refined.error, deviation):
         refined = _lengthen_steps(function, x, difference, refined, deviation)
     # Jacobians have the values first.
@@ -193,6 +196,7 @@ def _refine_differences(
     `step` is relative to a component's size, or to 1 if that is larger.
     """
     size = np.maximum(1.0, np.abs(x))
+    # Slopes (..., d, m), a bound of their rounding error, and where the function bends
     first = _take_differences(function, x, difference, step * size)
     error = _rounding_error(first, x)
     is_bent = first.is_bent
@@ -230,12 +234,16 @@ def _shorten_steps(
 ) -> Array:
     """Replace slopes of steps longer than a standard deviation that a shorter step contradicts.
 
-    A phase that turns many times within a step may look straight by chance. Slopes are (..., d, m).
+    A phase that turns many times within a step may look straight by chance. States x and their
+    standard deviations are (..., d), slopes (..., d, m), one row for each component that is
+    shifted. `first` has the differences over the first step.
     """
+    # Where the first step is longer than a known deviation, half of that is tried.
     is_long = (first.step > deviation) & (deviation > 0)
     h = np.where(is_long, 0.5 * deviation, first.step)
     short = _take_differences(function, x, difference, h)
-    # Differences below one percent of the steepest slope are curvature, which does no harm.
+    # Differences below one percent of the steepest slope are curvature, which does no harm; others
+    # must be more than the rounding of the short step.
     steepest = np.abs(short.slope).max(axis=-2, keepdims=True)
     limit = 1e-2 * steepest + _rounding_error(short, x)
     differs = is_long[..., None] & (np.abs(short.slope - slope) > limit)
@@ -255,6 +263,7 @@ def _take_differences(
     behind = x[..., None, :] - steps
     # x + h is rounded: the true step, 2 h, is the difference of the two states.
     true_steps = np.diagonal(ahead - behind, axis1=-2, axis2=-1)
+    # Values (..., d, m) on both sides, and (..., 1, m) between them
     f_ahead = np.asarray(call_user(function, ahead))
     f_behind = np.asarray(call_user(function, behind))
     f_centre = np.asarray(call_user(function, x[..., None, :]))
@@ -320,8 +329,10 @@ def _largest_in_row(slope: Array, deviation: Array) -> Array:
 def _may_be_noisy(first: _Differences, error: Array, deviation: Array) -> bool:
     """Whether noise of the values may spoil a slope, beside the other slopes of its row.
 
-    `error` (..., d, m) is the bound of the slopes' errors by :func:`_rounding_error`.
+    `error` (..., d, m) is the bound of the slopes' errors by :func:`_rounding_error`. `first` has
+    the differences over the first step, and `deviation` (..., d) the state's standard deviations.
     """
+    # Slopes times deviations are changes of the values; `row` has the largest of each value.
     weight = deviation[..., None]
     row = _largest_in_row(first.slope, deviation)
     # Such a bound is _MARGIN times the error that noise makes.
@@ -343,6 +354,8 @@ def _lengthen_steps(
 
     O. V. Lepski's rule, for each entry: a step is too long as soon as its slope differs from a
     shorter step's by more than the rounding of both. Slopes that rounding does not spoil stay.
+
+    `refined` has the slopes of the first step, or of shorter ones where the function bends.
     """
     first = refined.first
     slope = refined.slope
@@ -352,18 +365,22 @@ def _lengthen_steps(
     # deviations it is a hundredth of the component's size, or rounding would decide. A component
     # without uncertainty needs no slope.
     longest = np.where(deviation > 0, np.maximum(0.5 * deviation, 1e-2 * size), 0.0)
-    # Slopes of the steps so far, with bounds of their errors.
+    # Slopes of the steps so far, with bounds of their errors; which entries (..., d, m) agree with
+    # all of them; and the noise of the function's values, known once two steps have been taken.
     tried: list[tuple[Array, Array]] = []
     agrees = np.ones(slope.shape, dtype=bool)
     noise: Array = np.zeros(())
     h = first.step
     while (h < longest).any() and len(tried) < _MOST_STEPS:
+        # Each step is 16 times the last one, up to the longest.
         next_step = np.minimum(_RATIO * h, np.maximum(longest, first.step))
         h = np.where(h < longest, next_step, h)
         longer = _try_differences(function, x, difference, h)
+        # None if the function fails so far away.
         if longer is None:
             break
         if not tried:
+            # Noise n of the values is an error of up to n / h of a slope, with a margin.
             noise = _noise_of_two_steps(first, longer, x)
             first_bound = _MARGIN * noise / first.step[..., None]
             tried.append((first.slope, first_bound))
@@ -381,8 +398,10 @@ def _lengthen_steps(
         tried.append((longer.slope, bound))
         slope = np.where(agrees, longer.slope, slope)
         error = np.where(agrees, bound, error)
+        # Longer steps cannot agree any more, or no slope needs them.
         if not agrees.any() or _is_accurate(slope, error, deviation):
             break
+    # Of slopes that hardly differ the original ones stay.
     slope = _restore_close(refined.slope, slope, deviation)
     return _RefinedDifferences(first, slope, error)
 
@@ -425,20 +444,23 @@ def _try_differences(
 def _noise_of_two_steps(short: _Differences, long: _Differences, x: Array) -> Array:
     """Return the noise of the values (..., 1, m), from precision and from second differences.
 
-    Curvature makes a second difference 256 times as large over 16 times the step; noise leaves
-    it as it is. In between, less than 64 times as large counts as noise.
+    `short` and `long` are differences over a step and over one 16 times as long, from states `x`
+    (..., d). Curvature makes a second difference 256 times as large over the long step; noise
+    leaves it as it is. In between, less than 64 times as large counts as noise.
     """
     steepest = np.maximum(np.abs(short.slope), np.abs(long.slope))
+    # The part that the precision of the values explains
     rounding = _rounding_noise(short, x, steepest)
+    # The bend is the second difference f(x + h) - 2 f(x) + f(x - h), (..., d, m).
     bend = np.abs(short.bend)
-    # A second difference is noise if it hardly grows with the step, and either is small beside the
-    # value or was large enough for shorter steps to be taken. Where those showed curvature, it is
-    # none.
+    # It is noise if it hardly grows with the step, and either is below a thousandth of the value
+    # f(x), the centre, or is visible beside the change over the step (`is_bent`), so that shorter
+    # steps have been taken. Where those showed curvature, it is none.
     hardly_grows = np.abs(long.bend) < 64 * bend
     is_small = bend < 1e-3 * np.abs(short.centre)
     is_noise = hardly_grows & (is_small | short.is_bent)
     is_noise &= ~np.asarray(short.has_curvature)
-    # The largest over the components: each shows the noise of the same values.
+    # The largest over the components of the state: each shows the noise of the same values.
     visible = np.where(is_noise, bend, 0.0).max(axis=-2, keepdims=True)
     return np.asarray(np.maximum(rounding, visible))
 
@@ -483,6 +505,7 @@ def evaluate_derivative(
     """
     if owner.derivative is None:
         slope, error = differences()
+        # Warns at the first use if errors of the differences are too large to be of no effect.
         if tolerance is not None and scale is not None:
             is_uncertain = _is_uncertain(slope, error, scale, tolerance)
             if is_uncertain and is_first_use(owner, f"differences of {name}"):
@@ -493,6 +516,7 @@ def evaluate_derivative(
                     stacklevel=4,
                 )
         return slope
+    # The derivative that was given, compared with differences at its first use
     slope = call_derivative(owner.derivative, args, shape)
     if is_first_use(owner, "derivative") and _contradicts(slope, differences, static):
         warnings.warn(
@@ -513,6 +537,7 @@ def call_derivative(
     >>> call_derivative(lambda x: np.eye(2), (np.zeros((3, 2)),), (3, 2, 2)).shape
     (3, 2, 2)
     """
+    # A user's function might write into its arguments.
     copies = [x.copy() if type(x) is np.ndarray else x for x in args]
     result = call_user(derivative, *copies)
     refuse_mask(result, "derivative")
@@ -540,6 +565,7 @@ def _is_uncertain(slope: Array, error: Array, scale: Array, tolerance: Array) ->
     prediction, or beside the deviation of its noise, `tolerance` (..., m).
     """
     weight = np.broadcast_to(scale, slope.shape[:-2] + slope.shape[-1:])[..., None, :]
+    # The largest change of each value within a standard deviation of the state, (..., m, 1)
     row = (np.abs(slope) * weight).max(axis=-1, keepdims=True)
     noise_std = np.asarray(tolerance)[..., None]
     # A value without noise has no deviation with which an error could be compared.
@@ -556,6 +582,7 @@ def _contradicts(
 
     `differences` and `static` are those of :func:`evaluate_derivative`.
     """
+    # Where differences over two steps agree, the Jacobian has to agree with them too.
     reference, error = differences(step=_STEP)
     coarse, _coarse_error = differences(step=4 * _STEP)
     is_wrong = _find_wrong(slope, reference, coarse, error, static)
@@ -575,7 +602,8 @@ def _find_wrong(
     """Return which entries (..., m, d) differ from reliable differences by more than these may err.
 
     A row of the reference is reliable if another step's differences, `other`, agree to one percent
-    of its largest entry, or to its rounding, `error`.
+    of its largest entry, or to its rounding, `error`. The Jacobian is `slope`; `static` is the
+    derivative of a function that changes nothing, from which the size of a row is measured.
     """
     row_size = np.abs(reference - static).max(axis=-1, keepdims=True)
     step_error = np.abs(reference - other).max(axis=-1, keepdims=True)

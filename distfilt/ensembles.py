@@ -238,23 +238,27 @@ def exact_noise(avoid: Array, root: Array, rng: Rng) -> Array:
     rank = root.shape[-1]
     leading = np.broadcast_shapes(avoid.shape[:-2], root.shape[:-2])
     noise = rng.standard_normal((*leading, n, rank))
+    # First orthogonal to the constant vector and to the anomalies, then of the covariance L Lᵀ
     return _set_covariance(_project_out(noise, avoid), root)
 
 
 def _drop_null_columns(root: Array) -> Array:
     """Reduce a factor (..., k, r) of covariances to as many columns as their rank, up to rounding.
 
-    Noise of a lower rank needs fewer members. In a batch the rank is the largest.
+    Noise of a lower rank needs fewer members. In a batch the rank is the largest. The result is
+    (..., k, rank).
     """
     # Rows of unit length: the factor of the correlations.
     std = np.sqrt((root**2).sum(axis=-1))
     unit = np.where(std > 0, std, 1.0)[..., None]
-    # Singular values count if their squares exceed the rounding of the covariance.
+    # Singular values count if their squares, the eigenvalues of the correlations, exceed rounding:
+    # 64 ε for each component, relative to the largest.
     u, s, _vh = np.linalg.svd(root / unit)
     largest = s.max(axis=-1, initial=0.0, keepdims=True)
     is_positive = s**2 > 64 * s.shape[-1] * EPS * largest**2
     rank = int(is_positive.sum(axis=-1).max(initial=0))
-    # L Lᵀ = U S² Uᵀ, so that U S is a factor too, with zero columns last.
+    # L Lᵀ = U S² Uᵀ, so that U S is a factor too, with zero columns last. `lower_root` makes it
+    # lower triangular, which is the same on every machine.
     columns = u * (s * is_positive)[..., None, :]
     return lower_root(columns[..., :rank]) * unit
 
@@ -267,6 +271,7 @@ def _project_out(noise: Array, avoid: Array) -> Array:
     n, rank = noise.shape[-2:]
     anomalies = center_ensemble(avoid).anomalies
     length = np.sqrt((anomalies**2).sum(axis=-2, keepdims=True))
+    # Columns of length one; an orthonormal basis of their span, (..., N, p), and its dimension.
     unit_columns = anomalies / np.where(length > 0, length, 1.0)
     basis, independent = _orthonormal_basis(unit_columns)
     # Of N dimensions the constant vector takes one, and the anomalies take theirs.

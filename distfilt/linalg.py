@@ -63,6 +63,7 @@ def equal_weights(members: int) -> Array:
 def identity(dim: int) -> Array:
     """Return the identity matrix, made once for each size and read-only."""
     matrix = np.eye(dim)
+    # All callers share the cached array.
     matrix.setflags(write=False)
     return matrix
 
@@ -71,6 +72,7 @@ def identity(dim: int) -> Array:
 def upper_triangle(dim: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the rows and columns of a matrix's upper triangle, made once and read-only."""
     rows, columns = np.triu_indices(dim)
+    # All callers share the cached arrays.
     rows.setflags(write=False)
     columns.setflags(write=False)
     return rows, columns
@@ -122,8 +124,10 @@ def factor(cov: PositiveSemidefinite) -> Array:
 def cholesky(cov: Array) -> Array:
     """Lower Cholesky factors (..., d, d); LinAlgError if a matrix is not positive definite."""
     d = cov.shape[-1]
+    # A single matrix, whose leading axes, if any, have length 1.
     if cov.size == d * d > 0:
-        # LAPACK itself takes a fifth of numpy's time for one matrix.
+        # LAPACK itself takes a fifth of numpy's time for one matrix; `clean` puts zeros above the
+        # diagonal.
         lower, failed = dpotrf(cov.reshape(d, d), lower=1, clean=1)
         if failed:
             raise np.linalg.LinAlgError("Matrix is not positive definite")
@@ -132,7 +136,10 @@ def cholesky(cov: Array) -> Array:
 
 
 def _semidefinite_cholesky(cov: Array) -> Array:
-    """Return lower triangular factors (..., d, d), with a zero column where a pivot vanishes."""
+    """Return lower triangular factors (..., d, d), with a zero column where a pivot vanishes.
+
+    Covariances are (..., d, d), and may be singular.
+    """
     d = cov.shape[-1]
     # With unit variances, rounding has the same size in every entry: a few d ε.
     scaled, std = to_unit_variances(cov)
@@ -148,6 +155,7 @@ def _semidefinite_cholesky(cov: Array) -> Array:
     # Elimination has failed if L Lᵀ misses the matrix by more than the pivots left out can do.
     error = np.abs(lower @ lower.swapaxes(-1, -2) - scaled)
     largest_error = error.max(axis=(-2, -1), initial=0.0)
+    # There the factor is found in another way, which costs more.
     for index in np.argwhere(largest_error > 32 * d * EPS):
         matrix = tuple(index)
         lower[matrix] = _factor_from_eigenvectors(scaled[matrix])
@@ -183,7 +191,10 @@ def lower_root(columns: Array) -> Array:
 def broadcast_leading(
     first: tuple[int, ...], second: tuple[int, ...], name: str
 ) -> tuple[int, ...]:
-    """Broadcast leading axes, or raise an error that names the argument with the second ones."""
+    """Return the shape to which two shapes of leading axes, such as (runs, agents), broadcast.
+
+    If they do not, raise an error; `name` is that of the argument with the second shape.
+    """
     if first == second:
         return first
     try:
@@ -274,23 +285,30 @@ def _has_many_small_systems(matrix: Array, right: Array) -> bool:
 
 
 def _solve_one_factor(lower: Array, right: Array, transposed: bool) -> Array:
-    """Solve with one factor (d, d) for right-hand sides (..., d, k), as columns of one matrix."""
+    """Solve with one factor (d, d) for right-hand sides (..., d, k), as columns of one matrix.
+
+    The factor is lower triangular; `transposed` solves with its transpose.
+    """
     d, k = right.shape[-2:]
     if not right.size:
         return np.array(right)
+    # All right-hand sides as columns of one matrix (d, n)
     is_matrix = right.size == d * k
     if is_matrix:
         columns = right.reshape(d, k)
     else:
+        # The axis of d rows first, all others behind it
         columns = np.moveaxis(right, -2, 0).reshape(d, -1)
     if d <= _SMALL and columns.shape[1] > _MANY_PER_ROW * d:
-        # With so many columns LAPACK's copy to its own order costs more than the solution.
+        # With so many columns LAPACK's copy to its own order costs more than the solution, which is
+        # found row after row by numpy: one factor (d, d, 1) for right-hand sides (d, 1, n).
         x = np.array(columns[:, None], order="C")
         solution = _substitute(lower[..., None], x, transposed)
     else:
         solution, failed = dtrtrs(lower, columns, lower=1, trans=int(transposed))
         if failed:
             raise np.linalg.LinAlgError("Singular matrix")
+    # Back to the axes of the right-hand sides
     if is_matrix:
         return np.asarray(solution).reshape(right.shape)
     solution = solution.reshape(d, *right.shape[:-2], k)
@@ -298,8 +316,12 @@ def _solve_one_factor(lower: Array, right: Array, transposed: bool) -> Array:
 
 
 def _solve_in_blocks(lower: Array, right: Array, transposed: bool) -> Array:
-    """Solve many small systems (n, d, d) and (n, d, k), as many at once as the cache holds."""
+    """Solve many small systems (n, d, d) and (n, d, k), as many at once as the cache holds.
+
+    The factors are lower triangular; `transposed` solves with their transposes.
+    """
     solution = np.empty(right.shape)
+    # One more than there are, so that empty systems do not lead to a division by zero.
     numbers_each = 1 + lower[0].size + right[0].size
     block = max(1, _BLOCK_SIZE // numbers_each)
     for start in range(0, len(solution), block):
@@ -315,6 +337,7 @@ def _substitute(lower: Array, x: Array, transposed: bool) -> Array:
     """Solve n systems with factors (d, d, n), or one of all (d, d, 1), row after row.
 
     The right-hand sides `x` (d, k, n) are overwritten by the solutions, which are also returned.
+    The factors are lower triangular; `transposed` solves with their transposes.
     """
     d = len(x)
     if transposed:

@@ -85,6 +85,7 @@ def read_periods(periods: object, dim: int, names: Sequence[str] = ()) -> Period
     """
     if isinstance(periods, Mapping):
         entries: list[object] = [None] * dim
+        # A component's place by its index, and by its name.
         places: dict[object, int] = dict(enumerate(range(dim)))
         places |= {n: k for k, n in enumerate(names)}
         for key, period in periods.items():
@@ -103,6 +104,7 @@ def read_periods(periods: object, dim: int, names: Sequence[str] = ()) -> Period
     if entries and len(entries) != dim:
         raise ValueError(f"periods must have {dim} entries, got {len(entries)}")
     result = tuple([_read_period(period) for period in entries])
+    # An empty tuple if no component is circular.
     return result if any(period is not None for period in result) else ()
 
 
@@ -110,6 +112,7 @@ def _read_period(period: object) -> float | None:
     """Return one entry as a positive, finite float, or None where it is None."""
     if period is None:
         return None
+    # A bool is an int in Python.
     if isinstance(period, bool) or not isinstance(
         period, int | float | np.floating | np.integer
     ):
@@ -125,6 +128,7 @@ def _find_circular(periods: Periods) -> tuple[NDArray[np.intp], Array]:
     circular = [k for k, period in enumerate(periods) if period is not None]
     places = np.array(circular, dtype=np.intp)
     p = np.array([periods[k] for k in circular], dtype=np.float64)
+    # All callers share the cached arrays.
     places.setflags(write=False)
     p.setflags(write=False)
     return places, p
@@ -140,6 +144,7 @@ def align(values: Array, reference: Array, periods: Periods) -> Array:
     """
     if not periods:
         return values
+    # Indices of the circular components, and their periods
     places, p = _find_circular(periods)
     difference = values.take(places, axis=-1) - reference.take(places, axis=-1)
     # The usual case: all lie within half a period. NaN, a missing number, does not.
@@ -154,7 +159,7 @@ def align(values: Array, reference: Array, periods: Periods) -> Array:
 
 
 def _count_turns(difference: Array, p: Array) -> Array:
-    """Return how many whole periods to take off a difference; none where it is missing."""
+    """Return how many whole periods p (c,) to take off differences (..., c); none off NaN."""
     # A difference d - p k lies in [-p/2, p/2).
     turns: Array = np.floor(difference / p + 0.5)
     return np.where(np.isfinite(turns), turns, 0.0)
@@ -164,6 +169,7 @@ def wrap_differences(differences: Array, periods: Periods) -> Array:
     """Return differences (..., d) with the circular ones in [-period/2, period/2)."""
     if not periods:
         return differences
+    # Indices of the circular components, and their periods
     places, p = _find_circular(periods)
     # The usual case: all lie within half a period.
     size = np.abs(differences.take(places, axis=-1))
@@ -177,11 +183,12 @@ def circular_mean(
 ) -> Array:
     """Return the directions of mean vectors of members (..., N, d), as (..., 1, d).
 
-    Components that are not circular are zero.
+    Components that are not circular are zero. Without `weights` (..., N) all members count alike.
 
     >>> circular_mean(np.array([[3.0], [-3.0]]), (2 * np.pi,)).round(4)
     array([[3.1416]])
     """
+    # Indices of the c circular components, and their periods p (c,)
     places, p = _find_circular(periods)
     # Each member is a unit vector exp(2πi x/p) in the complex plane; the mean vector's direction
     # is that of their sum.
@@ -209,9 +216,11 @@ def fold_torn(members: Array, periods: Periods) -> Array:
     """
     if not periods:
         return members
+    # About the circular mean; the members themselves, if they lie on that branch already.
     folded = fold(members, periods)
     if folded is members:
         return members
+    # Indices of the circular components, and their periods
     places, p = _find_circular(periods)
     is_torn = 2 * folded.var(axis=-2) < members.var(axis=-2)
     # Members that were wrapped lie within one period, a little more with noise added since.
@@ -220,7 +229,10 @@ def fold_torn(members: Array, periods: Periods) -> Array:
 
 
 def settle(members: Array, periods: Periods, weights: Array | None = None) -> Array:
-    """Shift all members (..., N, d) alike, so that their mean is in [-period/2, period/2)."""
+    """Shift all members (..., N, d) alike, so that their mean is in [-period/2, period/2).
+
+    With `weights` (..., N) it is their weighted mean.
+    """
     if not periods:
         return members
     if weights is None:
@@ -322,12 +334,17 @@ def step_members(model: _Model, x: Array, t: float, dt: float) -> Array:
 
 
 def check_transition(model: _Model, x: Array, t: float, dt: float) -> None:
-    """Refuse periods that do not belong to a model: states a period apart must move alike."""
+    """Refuse periods that do not belong to a model: states a period apart must move alike.
+
+    The states x are (..., d), and move from t to t + dt.
+    """
     if not needs_check(model, "periods"):
         return
     periods = cast(Periods, model.periods)
+    # Indices of the circular components, and their periods
     places, p = _find_circular(periods)
     before = model.step(x, t, dt)
+    # Each circular component in turn moves on by one period.
     for place, period in zip(places, p, strict=True):
         turned = x.copy()
         turned[..., place] += period
@@ -358,15 +375,19 @@ def check_sensor(
     observed : ndarray, (..., m), optional
         Observations, of which a sensor that is a likelihood gives the density.
     """
+    # Once for each pair of a sensor and a model
     key = f"periods of model {id(model)}"
     if not needs_check(sensor, key):
         return
+    # A sensor that is a likelihood can only be tested at an observation.
     evaluate = getattr(sensor, "evaluate", None)
     if evaluate is not None and (observed is None or np.isnan(observed).all()):
         return
     mark_checked(sensor, key)
+    # A differential sensor compares with the state of the previous time.
     x = states.mean(axis=-2)
     args = () if previous is None else (previous.mean(axis=-2),)
+    # Each circular component in turn: a whole turn must not change the prediction.
     places, p = _find_circular(cast(Periods, model.periods))
     for place, period in zip(places, p, strict=True):
         turned = x.copy()
@@ -374,6 +395,7 @@ def check_sensor(
         name = name_component(model, place)
         if evaluate is not None:
             _check_likelihood(evaluate, sensor.kind, x, turned, observed, name)
+            # Without moments it predicts nothing.
             if getattr(sensor, "moments", None) is None:
                 continue
         before = sensor.predict(x, *args)
@@ -395,7 +417,11 @@ def _check_likelihood(
     observed: Array | None,
     name: str,
 ) -> None:
-    """Refuse a likelihood that differs for states (..., d) and those that have turned once."""
+    """Refuse a likelihood that differs for states (..., d) and those that have turned once.
+
+    The function ``evaluate(x, y)`` is the log-likelihood of a sensor of this kind, and `observed`
+    the observation y at which it is tested. The component that has turned is named in the error.
+    """
     before = evaluate(x, observed)
     after = evaluate(turned, observed)
     with np.errstate(invalid="ignore"):
@@ -441,12 +467,14 @@ def warn_of_wrapping(
     suspects = np.argwhere(is_narrow & is_near_turn & is_torn)
     if not len(suspects):
         return
+    # The first ensemble (run, agent) and component that may have been wrapped
     *row, place = suspects[0].tolist()
     # A jump proves nothing by itself. The function wraps the component if it moves x and x + 2π to
     # the same state, up to rounding.
     turned = x.copy()
     turned[..., place] += 2 * np.pi
     change = np.abs(model.step(turned, t, dt) - model.step(x, t, dt))
+    # The first member of that ensemble stands for all.
     if (change[tuple(row)][0] > 1e-6).any():
         return
     mark_checked(model, "wrapping")
@@ -472,6 +500,7 @@ def warn_of_wrapped_truth(model: _Model, mean: Array, truth: Array) -> None:
     """
     if len(mean) < 2:
         return
+    # A NaN is no turn: it compares as False.
     with np.errstate(invalid="ignore"):
         error = mean - truth
         jumps = np.diff(error, axis=0)
@@ -483,11 +512,13 @@ def warn_of_wrapped_truth(model: _Model, mean: Array, truth: Array) -> None:
         remainder = np.abs(error - 2 * np.pi * np.round(error / (2 * np.pi)))
         is_near = remainder < 0.5
         is_close = is_near[:-1] & is_near[1:] & (is_near.mean(axis=0) >= 0.9)
+        # The larger step of the two
         steps = [np.abs(np.diff(values, axis=0)) for values in (mean, truth)]
         is_leap = np.maximum(*steps) > np.pi
     found = np.argwhere(is_turn & is_leap & is_close)
     if not len(found) or not needs_check(model, "truth"):
         return
+    # The component of the first such jump
     mark_checked(model, "truth")
     place = int(found[0][-1])
     warnings.warn(

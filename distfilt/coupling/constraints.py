@@ -81,6 +81,7 @@ class Constraint(FrozenModel):
         """Return the residual (..., s) of any states (..., d): NaN where g has no value."""
         shape = (*x.shape[:-1], self.value.size)
         try:
+            # A copy, since a user's function might write into its argument.
             g = call_user(self.function, x.copy())
         except IndexError as error:
             raise ValueError(
@@ -94,6 +95,7 @@ class Constraint(FrozenModel):
     def jacobian(self, x: Annotated[ArrayInput, "... d"]) -> Array:
         """Return the derivative of g at states (..., d), (..., s, d)."""
         shape = (*x.shape[:-1], self.value.size, x.shape[-1])
+        # The derivative that the user gave, or these finite differences if there is none.
         differences = partial(difference_with_error, self.violation, x)
         return evaluate_derivative(self, (x,), shape, differences)
 
@@ -125,9 +127,9 @@ def norm_constraint(
 
     def jacobian(x: Array) -> Array:
         # The derivative of |x_I|² is 2 x_Iᵀ.
-        slope = np.zeros((*x.shape[:-1], 1, x.shape[-1]))
-        slope[..., 0, columns] = 2 * x[..., columns]
-        return slope
+        derivative = np.zeros((*x.shape[:-1], 1, x.shape[-1]))
+        derivative[..., 0, columns] = 2 * x[..., columns]
+        return derivative
 
     return Constraint(norm_squared, np.array([length**2]), derivative=jacobian)
 
@@ -264,18 +266,20 @@ def retract(
     ... ).round(12)
     array([ 0.6 ,  0.8 ,  0.64, -0.48])
     """
+    # Rows (N, d), which are moved in place
     x = states.reshape(-1, states.shape[-1]).copy()
     residual = constraint.residual(x)
     # Indices of the states that have not converged: only they take part.
     active = np.arange(len(x))
     for _ in range(_STEPS):
-        slope = constraint.jacobian(x[active])
-        error = _relative_error(constraint, x[active], residual[active], slope)
+        jacobian = constraint.jacobian(x[active])
+        error = _relative_error(constraint, x[active], residual[active], jacobian)
         is_unsolved = error > _TOLERANCE
         active = active[is_unsolved]
         if not active.size:
             break
-        step = _normal_step(slope[is_unsolved], residual[active])
+        # The Newton step along the normals, halved until the residual decreases
+        step = _normal_step(jacobian[is_unsolved], residual[active])
         search = _line_search(constraint, x[active], residual[active], step)
         x[active] = search.states
         residual[active] = search.residuals
@@ -284,8 +288,9 @@ def retract(
         is_tolerable = error[is_unsolved] <= _TOLERABLE
         active = active[search.has_decreased | ~is_tolerable]
     else:
-        slope = constraint.jacobian(x[active])
-        error = _relative_error(constraint, x[active], residual[active], slope)
+        # All steps are used up; the states that the last one moved may be solved.
+        jacobian = constraint.jacobian(x[active])
+        error = _relative_error(constraint, x[active], residual[active], jacobian)
         active = active[error > _TOLERANCE]
     if active.size:
         raise SolverError(
@@ -293,26 +298,27 @@ def retract(
             f"{_STEPS} Newton steps, |g - d| up to {np.abs(residual[active]).max():.3g}"
         )
     if motion is not None:
+        # In place
         _make_tangent(x, constraint, motion)
     return np.asarray(x.reshape(states.shape))
 
 
 def _relative_error(
-    constraint: Constraint, x: Array, residual: Array, slope: Array
+    constraint: Constraint, x: Array, residual: Array, jacobian: Array
 ) -> Array:
     """Return the largest relative residual (n,) of each state x (n, d), with Jacobians (n, s, d).
 
     The residuals (n, s) are taken relative to the magnitude of g_i, of which rounding is a part ε.
     """
     # Rounding of x alone changes g_i by up to ε |∇g_i| |x|.
-    state_unit = np.linalg.norm(slope, axis=-1) * np.linalg.norm(x, axis=-1)[:, None]
+    state_unit = np.linalg.norm(jacobian, axis=-1) * np.linalg.norm(x, axis=-1)[:, None]
     unit = np.maximum(np.abs(constraint.value), state_unit)
     # A residual of zero is exact, even where its unit is zero too.
     error = np.abs(residual) / np.where(residual == 0, 1.0, unit)
     return np.asarray(error.max(axis=-1))
 
 
-def _normal_step(slope: Array, residual: Array) -> Array:
+def _normal_step(jacobian: Array, residual: Array) -> Array:
     """Return the shortest step that removes `residual` to first order, -J'(J J')⁻¹(g - d).
 
     Jacobians are (n, s, d), residuals (n, s), steps (n, d).
@@ -320,7 +326,7 @@ def _normal_step(slope: Array, residual: Array) -> Array:
     # Normals of length one, so that the rank does not depend on the units of the constraints. A
     # zero normal becomes NaN, then zero, and its eigenvalue is zero.
     with np.errstate(invalid="ignore"):
-        normals = slope / np.linalg.norm(slope, axis=-1, keepdims=True)
+        normals = jacobian / np.linalg.norm(jacobian, axis=-1, keepdims=True)
     correlations = np.nan_to_num(normals @ normals.mT)
     smallest_eigenvalue = np.linalg.eigvalsh(correlations)[..., 0]
     is_deficient = ~(smallest_eigenvalue > _LEAST_EIGENVALUE)
@@ -329,8 +335,9 @@ def _normal_step(slope: Array, residual: Array) -> Array:
             "constraint must have a Jacobian of full rank, got one that loses rank at "
             f"state {is_deficient.argmax()} ({is_deficient.sum()} of {is_deficient.size})"
         )
-    multipliers = np.linalg.solve(slope @ slope.mT, residual[..., None])
-    return np.asarray(-(slope.mT @ multipliers)[..., 0])
+    # λ = (J J')⁻¹ (g - d), and the step -J' λ
+    multipliers = np.linalg.solve(jacobian @ jacobian.mT, residual[..., None])
+    return np.asarray(-(jacobian.mT @ multipliers)[..., 0])
 
 
 class _LineSearch(NamedTuple):
@@ -347,7 +354,7 @@ def _line_search(
     """Halve each state's step until its residual decreases.
 
     States and steps are (n, d), residuals (n, s). A state whose residual does not decrease stays
-    where it is.
+    where it is. Residuals are those of the constraint.
     """
     before = np.linalg.norm(residual, axis=-1)
     has_decreased = np.zeros(len(x), dtype=bool)
@@ -369,19 +376,26 @@ def _line_search(
 
 
 def _make_tangent(x: Array, constraint: Constraint, motion: Motion) -> None:
-    """Remove the part of the velocities along the normals, in the array of states (n, d) itself."""
+    """Remove the part of the velocities along the normals, in the array of states (n, d) itself.
+
+    The motion has the indices of positions and of velocities; the constraint is one on positions.
+    """
     positions = list(motion[0])
     velocities = list(motion[1])
     _check_motion(motion, x.shape[-1])
-    slope = constraint.jacobian(x)[..., positions]
+    jacobian = constraint.jacobian(x)[..., positions]
     # v <- v - Jᵀ(J Jᵀ)⁻¹ J v, so that J v = 0.
-    rate = (slope @ x[:, velocities, None])[..., 0]
-    x[:, velocities] += _normal_step(slope, rate)
+    rate = (jacobian @ x[:, velocities, None])[..., 0]
+    x[:, velocities] += _normal_step(jacobian, rate)
 
 
 def _check_motion(motion: Motion, d: int) -> None:
-    """Raise an error unless every position has a velocity of its own among d components."""
+    """Raise an error unless every position has a velocity of its own among d components.
+
+    The motion has the indices of positions, and of their velocities in the same order.
+    """
     positions, velocities = motion
+    # As many velocities as positions, and no component is both.
     paired = len(positions) == len(velocities)
     disjoint = not set(positions) & set(velocities)
     if not (paired and disjoint and max(*positions, *velocities) < d):

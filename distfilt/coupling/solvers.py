@@ -181,11 +181,15 @@ def transport_plan(
     >>> float(round(plan.value, 9)), plan.duality_gap < 1e-12
     (1.5, True)
     """
+    # Masses a of the rows and b of the columns.
     a, b = _normalize_masses(rows, columns, cost.shape[1])
     solve = solver_of(solver, regularisation)
+    # To certify a plan is to add potentials that bound its cost from below. The solver gets rows
+    # and columns with mass only, the entropic one the range of the links that are not forbidden.
     if solver == "entropic":
         return _certify(cost, a, b, _solve_allowed(cost, a, b, solve))
     plan = _certify(cost, a, b, _solve_on_support(cost, a, b, solve))
+    # Solved again if the bound shows that the plan is not optimal.
     return _improve(plan, cost, a, b, solve)
 
 
@@ -245,12 +249,15 @@ def _solve_on_support(
     """Solve for the rows and columns with mass, with their costs scaled for the solver.
 
     The unit of the scaled costs is their range: up to the limit, if there is one, above which costs
-    are larger than one. The potentials of columns without mass are zero.
+    are larger than one. The potentials of columns without mass are zero. Costs are (N, M), and a
+    (N,), b (M,) are the masses of rows and columns.
     """
     rows = np.flatnonzero(a)
     columns = np.flatnonzero(b)
+    # The costs between rows and columns with mass, scaled to lie between zero and one
     supported = scale_cost(_cost_on_support(cost, a, b), limit)
     part = solve(supported.scaled, a[rows], b[columns])
+    # Back to all rows and columns, and to potentials of the cost itself
     plan = np.zeros(cost.shape)
     plan[np.ix_(rows, columns)] = part.plan
     potential = np.zeros(cost.shape[1])
@@ -259,7 +266,12 @@ def _solve_on_support(
 
 
 def _solve_allowed(cost: Array, a: Array, b: Array, solve: Solve) -> Solution:
-    """Solve the entropic problem with the range of the links that are not forbidden."""
+    """Solve the entropic problem with the range of the links that are not forbidden.
+
+    Costs are (N, M), and a (N,), b (M,) are the masses of rows and columns. Forbidden links have
+    costs far above all others.
+    """
+    # The largest cost of a link that is not forbidden; None if there is no forbidden one.
     limit = _largest_allowed(_cost_on_support(cost, a, b))
     if limit is not None:
         try:
@@ -295,6 +307,7 @@ def _largest_allowed(cost: Array) -> float | None:
     values = np.sort(shifted[(shifted > 0) & (shifted >= dearest_minimum)])
     # Costs after which the next one is ten thousand times as large.
     gaps = np.flatnonzero(values[1:] > _FORBIDDEN * values[:-1])
+    # A vertex of the N x M transport polytope has mass on N + M - 1 links.
     n_links = sum(cost.shape) - 1
     for limit in values[gaps].tolist():
         if np.count_nonzero(shifted <= limit) >= n_links:
@@ -311,8 +324,10 @@ def _improve(
     one found. Beside a very large cost the others vanish in the solver's rounding. An optimal plan
     for the cut costs that uses no link above the limit is optimal for the costs themselves.
     """
+    # The costs between rows and columns with mass
     supported = _cost_on_support(cost, a, b)
     minimum = float(supported.min())
+    # Above this part of the plan's mean cost the solver would not resolve the others.
     limit = minimum + _RESOLVED * (plan.value - minimum)
     # Each round either makes the plan better or the limit a thousand times larger: few are needed.
     for _ in range(20):
@@ -326,11 +341,13 @@ def _improve(
             # The plan needs dearer links.
             limit = minimum + 1e3 * (limit - minimum)
             continue
+        # With a lower bound of the cost, from which the duality gap follows
         trial = _certify(cost, a, b, solution)
         if not trial.duality_gap < plan.duality_gap:
             break
         plan = trial
         limit = minimum + _RESOLVED * (plan.value - minimum)
+    # An error if the gap is still too wide.
     _check_gap(plan, minimum, a, b)
     return plan
 
@@ -338,7 +355,8 @@ def _improve(
 def _check_gap(plan: TransportPlan, minimum: float, a: Array, b: Array) -> None:
     """Raise an error if the duality gap is above a millionth of the cost, and above rounding.
 
-    The cost counts from its minimum, since a constant that is added to it changes nothing.
+    The cost counts from its minimum, since a constant that is added to it changes nothing. The
+    plan's potentials are (N,) and (M,), and so are the masses a of its rows and b of its columns.
     """
     f, g = plan.potentials
     # Rounding of the two sums of the bound, and of the cost, is proportional to their terms.
@@ -355,7 +373,8 @@ def _certify(cost: Array, a: Array, b: Array, solution: Solution) -> TransportPl
     """Return the plan with potentials that are feasible whatever the solver's were.
 
     Given the columns' potentials g (M,), the largest feasible f and then the largest feasible g are
-    taken: the best bound that can be had from them.
+    taken: the best bound that can be had from them. The cost is (N, M), the masses are a (N,) and b
+    (M,), and the solution is a solver's.
     """
     # A solver leaves out columns without mass; their potentials have no meaning.
     g = np.where(b > 0, solution.column_potential, -np.inf)
@@ -382,7 +401,7 @@ def _solve_network(cost: Array, a: Array, b: Array) -> Solution:
     """Solve by POT's network simplex.
 
     It is called directly: `ot.emd` around it would take 0.2 ms more, half as much as the solution
-    at N = 50.
+    at N = 50. The cost is (N, M), the masses are a (N,) and b (M,).
     """
     emd = import_optional("ot.lp.emd_wrap", "maps")
     plan, _value, _row_potential, column_potential, status = emd.emd_c(
@@ -398,8 +417,9 @@ def _solve_entropic(cost: Array, a: Array, b: Array, strength: float) -> Solutio
     """Solve by Newton's method, with an entropy whose weight is halved down to `strength`.
 
     Sinkhorn's iteration is slow on the plateaus of a dual with little entropy. Masses of zero are
-    left out.
+    left out. The cost is (N, M), the masses are a (N,) of the rows and b (M,) of the columns.
     """
+    # The costs between rows and columns with mass
     rows = np.flatnonzero(a)
     columns = np.flatnonzero(b)
     supported = cost[np.ix_(rows, columns)]
@@ -448,6 +468,7 @@ def _correct_in_proportion(matrix: Array, a: Array, b: Array) -> Array:
             [[np.diag(row_sums), matrix], [matrix.T, np.diag(column_sums)]]
         )
         errors = np.concatenate([a - row_sums, b - column_sums])
+        # The least-squares solution of least length; the other results are not needed.
         factors = np.linalg.lstsq(system, errors, rcond=1e-13)[0]
         u, v = np.split(factors, [a.size])
         matrix = matrix * np.maximum(1 + u[:, None] + v, 0.0)
@@ -492,7 +513,8 @@ def _solve_unit_entropy(
 
     Arguments are as of :func:`_evaluate_dual`; `tolerance` is for the error of the column sums,
     that of all columns together. The step is damped as by Levenberg and Marquardt: ten times less
-    after a success, ten times more after a failure.
+    after a success, ten times more after a failure. The error that remains is returned with the
+    solution.
     """
     # A start of one percent of the masses: far from the solution a full step could diverge.
     damping = 1e-2
@@ -534,6 +556,7 @@ def _correct_marginals(matrix: Array, a: Array, b: Array) -> Array:
     """
     for masses, axis in ((a, 1), (b, 0)):
         total = matrix.sum(axis=axis)
+        # Each factor is masses / total, at most 1.
         excess = total > masses
         factor = np.divide(masses, total, out=np.ones_like(total), where=excess)
         matrix *= np.expand_dims(factor, axis)
@@ -572,9 +595,11 @@ def monotone_plan(
     array([[0.25, 0.5 ],
            [0.25, 0.  ]])
     """
+    # Masses a of the sources and b of the targets, each in the order of their positions
     a, b = _normalize_masses(rows, columns, target.size)
     row_order = np.argsort(source, kind="stable")
     column_order = np.argsort(target, kind="stable")
+    # Rows, columns and masses of the N + M - 1 cells of the plan, in ranks
     staircase = _couple_in_order(a[row_order], b[column_order])
     # From ranks back to the given order.
     i = row_order[staircase.rows]
@@ -607,7 +632,8 @@ def _couple_in_order(a: Array, b: Array) -> _Staircase:
 
     Its cells go down and right like a staircase. Some may have a mass of zero.
     """
-    # The unit interval is cut at both cumulative sums; each interval is a cell.
+    # The unit interval is cut at both cumulative sums, but for the last, its end; each interval is
+    # a cell.
     cuts = np.concatenate([np.cumsum(a)[:-1], np.cumsum(b)[:-1]])
     edges = np.concatenate([[0.0], np.sort(np.minimum(cuts, 1.0)), [1.0]])
     # A cell's row and column: the number of cuts of each kind at or before its start.

@@ -81,7 +81,8 @@ def normalize_weights(
         raise ValueError(
             "log_weights must be numbers below infinity, got NaN or infinity"
         )
-    # Logarithms of weights, or of likelihoods, are negative as a rule.
+    # Logarithms of weights, or of likelihoods, are negative as a rule: positive numbers may be the
+    # weights themselves, of which a warning is given.
     if logs.size and logs.max() > 0:
         _warn_of_likelihoods(logs)
     # Divided by the largest weight, so that none overflows.
@@ -129,6 +130,7 @@ def _tie_breaker(n: int) -> Array:
     addition the choice is the same on every machine.
     """
     addition = _TIE_BREAK * np.random.default_rng(0).random((n, n))
+    # Read-only, since the cache returns the same array again.
     addition.setflags(write=False)
     return addition
 
@@ -164,19 +166,25 @@ def transport_plans(
            [0.  , 0.25]])
     """
     weights = normalize_weights(log_weights, ensemble.shape[:-1])
+    # POT's network simplex
     return _solve_plans(ensemble, weights, solver_of("network"), cost)
 
 
 def _solve_plans(
     ensemble: Array, weights: Array, solve: Solve, cost: Cost = "squared"
 ) -> Array:
-    """Return couplings (..., N, N) of weights (..., N) to equal masses, for members (..., N, d)."""
+    """Return couplings (..., N, N) of weights (..., N) to equal masses, for members (..., N, d).
+
+    `cost` names the cost of two members, and `solve` solves for one plan.
+    """
     n = weights.shape[-1]
+    # The squared distances of each ensemble of the batch, one after the other
     flat_ensemble = ensemble.reshape(-1, *ensemble.shape[-2:])
     squares = np.array([squared_distances(members) for members in flat_ensemble])
     costs = squares.reshape(*weights.shape, n)
     if cost == "distance":
-        # Distances are copies' up to the root of that part of the squared ones.
+        # Squared distances up to the part _ROUNDING of the largest are those of copies of one
+        # member. Of distances this part is the root of it.
         return _solve_couplings(np.sqrt(costs), weights, solve, _ROUNDING**0.5)
     return _solve_couplings(costs, weights, solve)
 
@@ -186,14 +194,17 @@ def _solve_couplings(
 ) -> Array:
     """Return couplings of the weights to equal masses, for costs (..., N, N).
 
-    Costs up to the part `rounding` of the largest one are those of copies.
+    Costs up to the part `rounding` of the largest one are those of copies. The weights are
+    (..., N), and `solve` solves for one plan.
     """
     n = weights.shape[-1]
     equal = np.full(n, 1 / n)
+    # Tiny, so that of several optimal plans the choice is the same on every machine.
     addition = _tie_breaker(n)
     plans = np.empty_like(costs)
     for index in np.ndindex(weights.shape[:-1]):
         scaled_cost = scale_cost(costs[index]).scaled
+        # Beside the costs of a few far members those of the others vanish in the solver's rounding.
         if _has_far_members(scaled_cost, rounding):
             plans[index] = _couple_far_members(
                 costs[index], weights[index], solve, rounding
@@ -215,6 +226,7 @@ def _has_far_members(scaled_cost: Array, rounding: float = _ROUNDING) -> bool:
     True
     False
     """
+    # Below a millionth of the largest cost
     is_small = scaled_cost < _FAR
     # A quick test for the usual case: of all costs, copies included, at most a fifth is small.
     # Without the copies, which are small, the part of small ones is less still.
@@ -231,17 +243,21 @@ def _couple_far_members(
 ) -> Array:
     """Return the coupling (N, N) of weights to equal masses where some members are far away.
 
-    Ties are broken by a part of the typical cost, the lower quartile, which is not above the
-    distances of near members.
+    Costs are (N, N); those up to the part `rounding` of the largest are between copies of a member.
+    Ties are broken by a part of the typical cost, the lower quartile of the others, which is not
+    above the distances of near members.
     """
     n = weights.size
     equal = np.full(n, 1 / n)
+    # The members that have any weight to speak of
     rows = np.flatnonzero(weights > _NO_MASS)
     # A constant that is taken off a column does not change the plan. Without it the cost of a far
     # place is only what it costs more to go there from one member than from another.
     excess_costs = costs[rows] - costs[rows].min(axis=0)
+    # The typical cost leaves out copies of a member.
     is_apart = costs > rounding * costs.max()
     typical = float(np.quantile(costs[is_apart], 0.25))
+    # A tiny addition that chooses among plans of one cost
     excess_costs = excess_costs + _tie_breaker(n)[rows] * typical
     mass = weights[rows].sum()
     part = _solve_in_stages(excess_costs, weights[rows] / mass, equal, typical, solve)
@@ -265,6 +281,7 @@ def _solve_in_stages(
     scaled_cost = scale_cost(cost)
     solution = solve(scaled_cost.scaled, a, b)
     plan = solution.plan
+    # The columns' potentials in units of the cost, (M,)
     g = scaled_cost.potential_of_cost(solution.column_potential)
     for limit in (1e6 * typical, 1e3 * typical):
         # Reduced costs c_ij - f_i - g_j >= 0, with f_i = min_j (c_ij - g_j).
@@ -332,7 +349,7 @@ def transform_ensemble(
     """
     weights = normalize_weights(log_weights, ensemble.shape[:-1])
     solve = solver_of(solver, regularisation)
-    # X⁺ = X N T, with members as columns.
+    # X⁺ = X N T, with members as columns and a coupling T (N, N) for each ensemble.
     plans = _solve_plans(ensemble, weights, solve, cost)
     transformed = apply_plan(ensemble, weights, plans)
     if debias:
@@ -353,7 +370,8 @@ def apply_plan(
 ) -> Array:
     """Transform members (..., N, d) with weights (..., N) by a coupling (..., N, N).
 
-    Equation (3) of Das and Bhattacharya. With `correct` the moments become the weighted ones.
+    Equation (3) of Das and Bhattacharya. With `correct` the moments become the weighted ones. The
+    new members are (..., N, d).
     """
     # x_j = m + N sum_i t_ij (x_i - m), since column j of the plan has the mass 1/N. About the
     # weighted mean m, so that members far from the origin lose no digits.
@@ -415,7 +433,8 @@ def _match_weighted_moments(
 ) -> Array:
     """Give members (..., N, d) the weighted mean and covariance of the ensemble.
 
-    The map is that of :func:`correct_moments`.
+    The map is that of :func:`correct_moments`. The members are `transformed`; the ensemble
+    (..., N, d) has the weights (..., N).
     """
     n = ensemble.shape[-2]
     mean = weights[..., None, :] @ ensemble
@@ -460,6 +479,7 @@ def _factor_by_size(covariance: Array) -> Array:
     """
     variances = np.diagonal(covariance, axis1=-2, axis2=-1)
     order = np.argsort(-variances, axis=-1, kind="stable")
+    # Rows, then columns, in this order
     sorted_rows = np.take_along_axis(covariance, order[..., :, None], axis=-2)
     lower = factor(np.take_along_axis(sorted_rows, order[..., None, :], axis=-1))
     # Back to the given order of components.
@@ -556,6 +576,7 @@ def transform_within(
     True
     """
     plan = len(ensemble) * transport_plans(ensemble, log_weights)
+    # The distinct numbers of pieces, P of them, and which of them each member has
     labels, index = np.unique(pieces, return_inverse=True)
     # Row p marks the members of piece p.
     membership = (index == np.arange(labels.size)[:, None]).astype(np.float64)
@@ -643,7 +664,8 @@ def transform_along(
     """
     n = ensemble.shape[-2]
     weights = normalize_weights(log_weights, ensemble.shape[:-1])
-    # All pairs (i, j): the tangent vector at member j that points to member i.
+    # All pairs (i, j): the tangent vector at member j that points to member i. Copies, since the
+    # user's functions might write into their arguments.
     points, bases = np.broadcast_arrays(
         ensemble[..., :, None, :], ensemble[..., None, :, :]
     )
@@ -653,6 +675,7 @@ def transform_along(
         (*ensemble.shape[:-1], n, "k"),
     )
     costs = (tangents * tangents).sum(axis=-1)
+    # Optimal couplings (..., N, N) of the weights to equal masses, by POT's network simplex.
     plans = _solve_couplings(costs, weights, solver_of("network"))
     # v_j = N sum_i t_ij difference(x_i, x_j).
     steps = n * np.einsum("...ij,...ijk->...jk", plans, tangents)

@@ -98,10 +98,13 @@ def estimate_without_messages(
 def _encode(snapshot: SwarmSnapshot, modes: int | None, densities: Array) -> Array:
     """Return the numbers that the agents average, (A, k + 1).
 
-    Densities (A, n) or their k cosine coefficients, and the indicator of the first present agent.
+    They are densities (A, n), of k = n cells, or as many of their cosine coefficients as there are
+    `modes`, and behind them the indicator of the first present agent. The snapshot has the grid,
+    and says which agents are present.
     """
     values = densities
     if modes is not None:
+        # The coefficients in an orthonormal basis are integrals over the box.
         values = densities @ snapshot.grid.cosines(modes) * snapshot.grid.volume
     # One agent has the input 1, all others 0: its average counts the agents.
     leader = np.arange(len(values)) == np.argmax(snapshot.present)
@@ -229,7 +232,12 @@ class DynamicAverage(FrozenModel, ConsensusProtocol):
     def update(
         self, memory: Memory, snapshot: SwarmSnapshot, channel: Channel, dt: float
     ) -> Update:
-        """Mix the estimates, and add the change of each agent's input, its encoded kernel."""
+        """Mix the estimates, and add the change of each agent's input, its encoded kernel.
+
+        Memory and messages hold encoded densities, (A, k + 1): the k cosine coefficients or cells
+        of each agent's density, and a number whose average counts the agents.
+        """
+        # The estimates, and the inputs at the last step
         estimates, previous = memory
         inputs = _encode(snapshot, self.modes, snapshot.kernels)
         graph = channel.graph
@@ -245,13 +253,18 @@ class DynamicAverage(FrozenModel, ConsensusProtocol):
         # x ← W x + (u - u_previous) conserves mean(x) = mean(u), as the columns of W sum to one.
         mixed = channel.mix(estimates, weights, on_loss=on_loss)
         estimates = mixed + (inputs - previous)
+        # Back to densities on the grid, (A, n), and to numbers of agents, (A,)
         densities, n_agents = _decode(estimates, snapshot, self.modes)
         return (estimates, inputs), densities, n_agents
 
     def _warn_of_bias(self, faults: Faults) -> None:
-        """Warn, once for each rule, that lost messages move the sum of the estimates."""
+        """Warn, once for each rule, that lost messages move the sum of the estimates.
+
+        The faults are those of the channel.
+        """
         if faults.is_perfect or not needs_check(self, "losses"):
             return
+        # Remembered, so that the next loss gives no warning.
         mark_checked(self, "losses")
         warnings.warn(
             "faults must not lose messages on one-way links for a DynamicAverage, whose estimates "

@@ -45,6 +45,7 @@ class Flooding(FrozenModel, ConsensusProtocol):
     ) -> Update:
         """Send each agent's table to its neighbours, and retain the latest of each entry."""
         (table_before,) = memory
+        # Row (i, j) is agent j's position as agent i knows it, and, last, the time of it.
         table = _insert_positions(snapshot, table_before)
         received = channel.broadcast(snapshot.select_payloads(table))
         latest = table.copy()
@@ -141,12 +142,14 @@ class Neighbours(FrozenModel, ConsensusProtocol):
         self, memory: Memory, snapshot: SwarmSnapshot, channel: Channel, dt: float
     ) -> Update:
         """Send each agent's position, and average the kernels at all received positions."""
+        # Row (i, j) is agent j's position as agent i knows it, and, last, the time of it.
         table = _insert_positions(snapshot, _empty_table(snapshot))
         payloads = snapshot.select_payloads(snapshot.positions)
         for i, inbox in enumerate(channel.broadcast(payloads)):
             for j, position in inbox.items():
                 table[i, j, :-1] = position
                 table[i, j, -1] = snapshot.t
+        # All entries count but those never received, whose time is _NEVER.
         densities, counts = _average_kernels(table, _NEVER / 2, snapshot)
         return (), densities, counts
 

@@ -111,6 +111,7 @@ class FokkerPlanck(FrozenModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # Corners of the two boxes
         same_low = np.array_equal(self.grid.low, self.swarm.low)
         same_high = np.array_equal(self.grid.high, self.swarm.high)
         if not (same_low and same_high):
@@ -126,7 +127,8 @@ class FokkerPlanck(FrozenModel):
         """The faces between neighbouring cells, those across the first axis first."""
         grid = self.grid
         cells = np.arange(grid.size).reshape(grid.shape)
-        # A face lies between a cell and the next along its axis.
+        # A face lies between a cell and the next along its axis: all cells but the last are below
+        # one, all but the first above one.
         below = [np.delete(cells, -1, axis=k).ravel() for k in range(grid.dim)]
         above = [np.delete(cells, 0, axis=k).ravel() for k in range(grid.dim)]
         axis = np.repeat(np.arange(grid.dim), [len(cells) for cells in below])
@@ -216,7 +218,7 @@ class FokkerPlanck(FrozenModel):
         )
 
         def step(p: Array) -> Array:
-            # SuperLU solves for all columns at once; each is one density.
+            # SuperLU solves for all columns at once, stored column by column; each is one density.
             columns = right @ p.reshape(-1, self.grid.size).T
             solution = factors.solve(np.asfortranarray(columns))
             return np.ascontiguousarray(solution.T).reshape(p.shape)
@@ -227,13 +229,15 @@ class FokkerPlanck(FrozenModel):
         """Return a step of backward Euler along one axis after the other.
 
         All lines of cells along an axis are solved at once. The tridiagonal elimination has no
-        subtraction, so that no rounding makes a density negative.
+        subtraction, so that no rounding makes a density negative. The step takes densities (..., n)
+        from t to t + dt.
         """
         grid = self.grid
         # Backward Euler uses the rates at the end of the step.
         forwards, backwards = self._rates(t + dt)
         factors = []
         for k in range(grid.dim):
+            # Of all lines of cells along axis k, which comes first
             up = dt * self._rates_across(forwards, k)
             down = dt * self._rates_across(backwards, k)
             factors.append(_factorize_tridiagonal(up, down))
@@ -273,9 +277,10 @@ class FokkerPlanck(FrozenModel):
 
 
 class _TridiagonalFactors(NamedTuple):
-    """Factors of matrices with the pivots p_i of Gauss's elimination.
+    """Factors of tridiagonal matrices with the pivots p_i of Gauss's elimination.
 
-    They are f_i / p_i and b_i / p_i, (n - 1, ..., 1), and 1 / p_i, (n, ..., 1).
+    With the rates f_i forwards and b_i backwards of :func:`_factorize_tridiagonal` they are
+    f_i / p_i and b_i / p_i, (n - 1, ..., 1), and 1 / p_i, (n, ..., 1).
     """
 
     lower: Array
@@ -310,7 +315,11 @@ def _factorize_tridiagonal(forwards: Array, backwards: Array) -> _TridiagonalFac
 
 
 def _solve_tridiagonal(x: Array, factors: _TridiagonalFactors) -> None:
-    """Solve for densities x (n, ..., k) in place along the first axis, by substitution."""
+    """Solve for densities x (n, ..., k) in place along the first axis, by substitution.
+
+    The factors are f_i / p_i, b_i / p_i and 1 / p_i, with the rates f_i and b_i between cells and
+    the pivots p_i.
+    """
     lower, upper, reciprocals = factors
     # Forward: y_{i+1} = x_{i+1} + (f_i / p_i) y_i.
     for i in range(len(lower)):

@@ -64,7 +64,8 @@ class Grid(FrozenModel):
                 raise ValueError(
                     f"{name} must have {self.dim} entries, got {corner.size}"
                 )
-            # One number for all axes, or one for each.
+            # One number for all axes, or one for each. The dataclass is frozen, so that the field
+            # cannot be assigned to.
             object.__setattr__(self, name, np.broadcast_to(corner, (self.dim,)))
         if (self.width <= 0).any():
             raise ValueError(f"high must be above low = {self.low}, got {self.high}")
@@ -157,6 +158,7 @@ class Grid(FrozenModel):
     def histogram(self, positions: Annotated[ArrayInput, "... n self.dim"]) -> Array:
         """Histogram of N agents (..., N, d), N ≥ 1, as a density in the n cells, (..., n)."""
         agents = positions.shape[-2]
+        # How many agents each cell has, for one swarm after the other.
         cells = self.cell_index(positions).reshape(-1, agents)
         rows = [np.bincount(row, minlength=self.size) for row in cells]
         counts = np.reshape(rows, (*positions.shape[:-2], self.size))
@@ -221,6 +223,7 @@ class Grid(FrozenModel):
             # Sums over cells are exact: the norm may be computed by them.
             norms = np.sqrt((modes**2).sum(axis=0) * self.volume)
             modes = np.asarray(modes / norms)
+            # Read-only, since all callers share the cached array.
             modes.setflags(write=False)
             self._cosine_cache[rank] = modes
         return self._cosine_cache[rank]

@@ -52,11 +52,13 @@ def _axis_kernels(x: Array, grid: Grid, k: int, width: Array) -> Array:
     """Means of reflected kernels over the cells of axis k, (..., n_k).
 
     The kernels are at coordinates x (...) along this axis, with standard deviations `width` (...).
+    Walls at both ends of the axis reflect them.
     """
     edges = grid.edges[k]
     low = edges[0]
     span = edges[-1] - low
     # The normal distribution function of u is (1 + erf(u / (√2 σ))) / 2.
+    # The kernels' masses in the cells, (..., n_k), first without a reflection.
     scale = np.sqrt(2.0) * width[..., None]
     mass = _cell_masses(x, edges, scale)
     # Reflection at both walls adds images, at x + 2 m span and 2 low - x + 2 (m + 1) span. Measured
@@ -125,14 +127,17 @@ def check_resolution(grid: Grid, bandwidth: float | Array) -> None:
 
 
 def _check_axis_widths(grid: Grid, bandwidth: Array) -> None:
-    """Do as `check_resolution` with bandwidths (1, d) or (N, d), along every axis by itself."""
+    """Do as `check_resolution` with bandwidths (1, d) or (N, d), along every axis by itself.
+
+    The bandwidths have a column for each axis of the grid.
+    """
     if (bandwidth > _WIDEST * grid.width).any():
         raise ValueError(
             f"bandwidth must be at most {_WIDEST} widths of the box along every axis, got "
             f"{bandwidth.max(axis=0).tolist()}"
         )
     least = bandwidth.min(axis=0)
-    # With the same tolerance of rounding
+    # With a tolerance of rounding, for grids that are made to fit exactly
     if (grid.spacing > 2 * least * (1 + 1e-12)).any():
         raise ValueError(
             "grid must have cells no wider than two bandwidths along every axis, "
@@ -145,10 +150,12 @@ def _axis_factors(
 ) -> list[Array]:
     """Factors (..., N, n_k) of each agent's kernel, one array for each axis k.
 
-    A Gaussian with independent components is the product of its factors along the axes.
+    A Gaussian with independent components is the product of its factors along the axes. Positions
+    are (..., N, d), and factors are means over the cells along an axis of the grid.
     """
     check_resolution(grid, bandwidth)
     grid._check_inside(positions)
+    # A width for each agent and axis, (..., N, d)
     if np.ndim(bandwidth) == 2:
         widths = np.broadcast_to(bandwidth, positions.shape)
     else:
@@ -399,13 +406,18 @@ def bandwidth(
         width = np.maximum(silverman * factor, least)
         candidates.append(width if each_axis else float(width))
     spread_out = _undo_rounding(positions, grid, step)
+    # Agents that are still in one place have one number.
     places = _number_places(spread_out, grid)
     scores = [_cross_validation_score(spread_out, grid, h, places) for h in candidates]
     return candidates[int(np.argmin(scores))]
 
 
 def _number_places(x: Array, grid: Grid) -> Indices | None:
-    """Number the places of agents (N, d), the same for agents in one place; None without ties."""
+    """Number the places of agents (N, d), the same for agents in one place; None without ties.
+
+    The result is (N,). Places are told apart to a small part of the grid's width.
+    """
+    # Positions that agree to this length along each axis are the same place.
     unit = _NO_DISTANCE * grid.width
     cells = np.round((x - grid.low) / unit)
     places, index = np.unique(cells, axis=0, return_inverse=True)
@@ -439,6 +451,7 @@ def _undo_rounding(x: Array, grid: Grid, step: Array) -> Array:
     ratios = np.array([0.6180339887, 0.7548776662, 0.8191725134])[: grid.dim]
     ranks = np.empty(len(x))
     ranks[np.lexsort(x.T)] = np.arange(len(x))
+    # Offsets in [-½, ½). Any start of the sequence would do; here it is 1.5.
     offsets = ((ranks[:, None] + 1.5) * ratios) % 1 - 0.5
     moved = x + offsets * step
     # Reflected at the walls, as the kernels are.
@@ -448,7 +461,11 @@ def _undo_rounding(x: Array, grid: Grid, step: Array) -> Array:
 
 
 def _lattice_step(values: Array, width: float) -> float:
-    """Return the step of the lattice on which tied coordinates lie; 0 without ties or lattice."""
+    """Return the step of the lattice on which tied coordinates lie; 0 without ties or lattice.
+
+    `values` (N,) are coordinates along one axis of a box, and `width` is that of the box.
+    """
+    # In units of a distance that counts as none
     unique = np.unique(np.round(values / (_NO_DISTANCE * width)))
     # Without ties, or with all in one place, nothing shows a lattice.
     if not 1 < len(unique) < len(values):
@@ -466,9 +483,11 @@ def _cross_validation_score(
 ) -> float:
     """∫p̂² - (2/N) Σ p̂₋ᵢ(Xᵢ), with the leave-one-out estimates p̂₋ᵢ.
 
-    With numbers of the agents' places, all agents in the place of agent i are left out.
+    With numbers of the agents' places, all agents in the place of agent i are left out. The agents
+    are at x (N, d), and h is the bandwidth.
     """
     n = len(x)
+    # The kernel of each agent on the grid, (N, n), and the estimate p̂
     z = kernels(x, grid, bandwidth=h)
     mean = z.mean(axis=0)
     # Entry (i, j) is the kernel of agent i in the cell of agent j; the diagonal, an agent's kernel

@@ -113,7 +113,10 @@ def dense_step(
 
 
 def _noise_strength(noise: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Validate the strength R of each filter's noise; infinite where nothing is measured."""
+    """Validate the strength R of each filter's noise; infinite where nothing is measured.
+
+    The shape is that of the result, (F, n) for F filters on n cells, or (n,).
+    """
     strength = check_array(noise, "noise", (..., shape[-1]), finite=False)
     # Written so that NaN is refused too.
     if not strength.min() > 0:
@@ -213,6 +216,7 @@ def low_rank_start(
     # M = I and b = 0: no data yet.
     information = np.tile(np.eye(rank), (filters, 1, 1))
     vector = np.zeros((filters, rank))
+    # Copies, since the arguments may be the user's arrays.
     return LowRank.construct(basis.copy(), base.copy(), information, vector)
 
 
@@ -261,7 +265,8 @@ def low_rank_predict(
     # √Δ L_Q, the same for all filters
     noise = np.broadcast_to(np.sqrt(dt) * process, (len(base), *process.shape))
     forecast = np.concatenate([factors, noise], axis=-1)
-    # Right singular vectors of the forecast's factor, by increasing singular value.
+    # Right singular vectors of the forecast's factor, by increasing singular value. Its products
+    # with the last of them, the leading ones, are the truncated factor.
     vectors = np.linalg.eigh(forecast.mT @ forecast).eigenvectors
     leading = vectors[..., -factors.shape[-1] :]
     return low_rank_start(forecast @ leading, base)
@@ -270,7 +275,10 @@ def low_rank_predict(
 def _transition_columns(
     transition: Transition, columns: Array, base: Array
 ) -> tuple[Array, Array]:
-    """Apply the transition to columns (..., n, r) and to densities (F, n), in one call."""
+    """Apply the transition to columns (..., n, r) and to densities (F, n), in one call.
+
+    The densities are `base`; the result has both parts apart again.
+    """
     rows = columns.mT
     # Densities and basis columns are all rows for the transition.
     stacked = np.concatenate([rows.reshape(-1, base.shape[-1]), base])
@@ -316,6 +324,7 @@ def low_rank_step(
     weighted = precision * (observed - state.base)
     # Δ Sᵀ R⁻¹ (y - base), (F, r), in a common basis or in one for each filter
     increment = (weighted[:, None, :] @ state.basis)[:, 0]
+    # Δ Sᵀ R⁻¹ S, (F, r, r)
     information = state.information + _gram_matrices(state.basis, precision)
     # The least eigenvalue is 1 or more: without large entries no matrix is ill-conditioned.
     if not information.max() < _MAX_CONDITION:

@@ -99,9 +99,11 @@ def intersect_gaussians(
     leading = broadcast_leading(leading, covs.shape[:-3], "covs")
     n_sources, d = means.shape[-2:]
     means = np.broadcast_to(means, (*leading, n_sources, d))
+    # A source without weight may be NaN: it is absent, and the numbers of another stand there.
     present = np.broadcast_to(weights > 0, (*leading, n_sources))
-    means = _fill_absent(means, present, 1, "means")
-    lower = cholesky(_fill_absent(covs, present, 2, "covs"))
+    means = _fill_absent(means, present, "means", component_axes=1)
+    covs = _fill_absent(covs, present, "covs", component_axes=2)
+    lower = cholesky(covs)
     first_lower = lower[..., 0, :, :]
     first_mean = means[..., 0, :]
     first_weight = weights[..., :1, None]
@@ -116,6 +118,7 @@ def intersect_gaussians(
     stacked = scaled.reshape(*scaled.shape[:-3], -1, d + 1)
     total = stacked[..., :d].mT @ stacked
     total[..., :d] += first_weight * np.eye(d)  # G₁ = I
+    # The Cholesky factor C of Σ ω_b G_bᵀ G_b. Weights but the first are in `scaled` already.
     unit_weights = np.ones(scaled.shape[:-2])
     information_root = _factor_sum(
         total[..., :d], first_weight, unit_weights, scaled[..., :d]
@@ -128,16 +131,21 @@ def intersect_gaussians(
     return first_mean + fused[..., d], symmetrise(fused[..., :d])
 
 
-def _fill_absent(value: Array, present: Mask, axes: int, name: str) -> Array:
+def _fill_absent(
+    value: Array, present: Mask, name: str, *, component_axes: int
+) -> Array:
     """Put the first present source in the place of those that are absent.
 
     Their weight is zero, so that any finite numbers do; NaN times zero would be NaN. `present`
-    (..., B) says which of B sources are, and `value` has `axes` more axes.
+    (..., S) marks the sources that are present. `value` has one more axis for means (..., S, d),
+    and two for covariances (..., S, d, d). `name` is that of the argument, for the error.
     """
     if not present.all():
         source_axis = present.ndim - 1
-        value = np.broadcast_to(value, present.shape + value.shape[-axes:])
-        expanded = present.reshape(present.shape + (1,) * axes)
+        components = value.shape[-component_axes:]
+        value = np.broadcast_to(value, present.shape + components)
+        # The flags (..., S, 1) or (..., S, 1, 1), for broadcasting with the value.
+        expanded = present.reshape(present.shape + (1,) * component_axes)
         # The largest of flags is the first that is set.
         first = expanded.argmax(axis=source_axis, keepdims=True)
         substitute = np.take_along_axis(value, first, axis=source_axis)
@@ -228,7 +236,7 @@ def intersection_weights(
     leading = broadcast_leading(present.shape[:-1], covs.shape[:-3], "covs")
     present = np.broadcast_to(present, (*leading, covs.shape[-3]))
     covs = np.broadcast_to(covs, (*leading, *covs.shape[-3:]))
-    covs = _fill_absent(covs, present, 2, "covs")
+    covs = _fill_absent(covs, present, "covs", component_axes=2)
     if rule in ("min_trace", "min_determinant") and present.shape[-1] > 1:
         return _search_weights(covs, present, determinant=rule == "min_determinant")
     # ω_b ∝ 1 / size_b, by logarithms.
@@ -237,13 +245,17 @@ def intersection_weights(
         log_sizes = np.log(np.trace(covs, axis1=-2, axis2=-1))
     elif rule == "determinant":
         log_sizes = log_det(cholesky(covs)) / covs.shape[-1]
+    # An absent source has the weight exp(-inf) = 0.
     log_sizes = np.where(present, log_sizes, np.inf)
     weights = np.exp(log_sizes.min(axis=-1, keepdims=True) - log_sizes)
     return np.asarray(weights / weights.sum(axis=-1, keepdims=True))
 
 
 def _search_weights(covs: Array, present: Mask, *, determinant: bool) -> Array:
-    """Weights of least determinant or trace: of two present sources by their eigenvalues."""
+    """Weights (..., S) of least determinant or trace: of two present sources by their eigenvalues.
+
+    Covariances are (..., S, d, d), and `present` (..., S) marks the sources that are present.
+    """
     s, d = covs.shape[-3:-1]
     flat_covs = covs.reshape(-1, s, d, d)
     flat_present = present.reshape(-1, s)
@@ -279,6 +291,7 @@ class _Problem:
     @classmethod
     def build(cls, covs: Array, present: Array, determinant: bool) -> _Problem:
         """Transform covariances (n, S, d, d) to the first source's coordinates."""
+        # L_b⁻¹ L₁, and P_b⁻¹ = (L_b⁻¹ L₁)ᵀ (L_b⁻¹ L₁) in the first source's coordinates
         lower = cholesky(covs)
         roots = solve_lower(lower, np.broadcast_to(lower[:, :1], lower.shape))
         roots *= present[..., None, None]
@@ -286,7 +299,10 @@ class _Problem:
         return cls(roots, information, lower[:, 0], present, determinant)
 
     def select(self, mask: Mask) -> _Problem:
-        """Keep some of the fusions."""
+        """Keep some of the fusions.
+
+        The mask is (n,).
+        """
         return _Problem(
             self.roots[mask],
             self.information[mask],
@@ -303,6 +319,7 @@ class _Problem:
         total = weights[:, None, :] @ flat_information
         no_identity = np.zeros((1, 1))
         lower = _factor_sum(total.reshape(n, d, d), no_identity, weights, self.roots)
+        # C⁻¹ G_bᵀ for all sources side by side, with the roots G_b
         half = solve_lower(lower, self.roots.reshape(n, s * d, d).mT)
         # C⁻¹ P_b⁻¹ C⁻ᵀ: each source's information where that of the result is the identity.
         relative = _square(half.reshape(n, d, s, d).swapaxes(1, 2))
@@ -328,7 +345,11 @@ class _Problem:
 # Where ratios of covariances overflow, the duality gap is NaN and no step is taken.
 @np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def _minimize(covs: Array, present: Mask, *, determinant: bool) -> Array:
-    """Weights of least determinant or trace; see :func:`.intersection_weights` for the method."""
+    """Weights (..., S) of least determinant or trace; :func:`.intersection_weights` has the method.
+
+    Covariances are (..., S, d, d), and `present` (..., S) marks the sources that are present.
+    """
+    # All leading axes become one, n fusions, which are optimised together.
     s, d = covs.shape[-3:-1]
     is_present = present.reshape(-1, s).astype(np.float64)
     problem = _Problem.build(covs.reshape(-1, s, d, d), is_present, determinant)
@@ -343,6 +364,7 @@ def _minimize(covs: Array, present: Mask, *, determinant: bool) -> Array:
     step_size = np.ones((n, 1))
     index = np.arange(n)
     for _ in range(_MAX_STEPS):
+        # The objective (n,), minus its gradient (n, S), and the Hessian (n, S, S)
         value, slope, curvature = problem.derivatives(weights)
         mean = (weights * slope).sum(axis=-1, keepdims=True)
         duality_gap = slope.max(axis=-1) / mean[:, 0] - 1
@@ -387,7 +409,7 @@ def _minimize_pair(covs: Array, *, determinant: bool) -> Array:
     eigenvalues = root * root
     # The objective is Σ c_i / u_i for the trace, with c_i = |L₁ v_i|², and -Σ log u_i for the
     # determinant. Its slope in ω has the sign of 1 - g with the mean g = Σ s_i λ_i of weights
-    # s_i ∝ c_i / u_i², and s_i ∝ 1 / u_i.
+    # s_i ∝ c_i / u_i², and s_i ∝ 1 / u_i: c_i is the `size`, and the exponent of u_i the `power`.
     size = np.ones_like(eigenvalues)
     power = 1
     if not determinant:
@@ -418,6 +440,7 @@ def _minimize_pair(covs: Array, *, determinant: bool) -> Array:
         error = np.log(mean)
         low = np.where(error > 0, log_odds, low)
         high = np.where(error < 0, log_odds, high)
+        # With the odds o the derivative is -d log g / d log o = power Σ s_i (λ_i - g) part_i / g.
         centred = (eigenvalues - mean[:, None]) * part
         slope = power * _average(centred, shares) / mean
         newton = log_odds + error / slope
@@ -451,8 +474,13 @@ def _square(root: Array) -> Array:
 def _newton_step(
     weights: Array, slope: Array, mean: Array, curvature: Array, present: Array
 ) -> Array:
-    """Weights after a Newton step on the simplex; a vanishing weight shrinks a thousandfold."""
-    # The Hessian with a multiplier for weights that vanish, and a ridge where it is singular.
+    """Weights after a Newton step on the simplex; a vanishing weight shrinks a thousandfold.
+
+    For n fusions of S sources the weights, minus the gradient `slope`, and `present`, 1 or 0, are
+    (n, S); `mean` (n, 1) is the slopes' weighted mean, and `curvature` (n, S, S) the Hessian.
+    """
+    # The Hessian with a multiplier for weights that vanish, and a ridge where it is singular: 1e-12
+    # of its largest entry. An absent source has a row of its own, apart from the others.
     size = curvature.max(axis=(-2, -1))[:, None]
     excess = np.maximum(mean - slope, 0.0)
     multiplier = excess / np.maximum(weights, _SMALLEST_WEIGHT)
@@ -469,8 +497,9 @@ def _newton_step(
     # x = H⁻¹ g - λ H⁻¹ 1, with λ such that the sum stays one.
     direction = solution[..., 0]
     constraint = solution[..., 1]
-    multiplier = direction.sum(axis=1)[:, None] / constraint.sum(axis=1)[:, None]
-    moved = weights + direction - multiplier * constraint
+    sum_multiplier = direction.sum(axis=1)[:, None] / constraint.sum(axis=1)[:, None]
+    moved = weights + direction - sum_multiplier * constraint
+    # No weight shrinks to less than a thousandth, or to zero.
     floor = np.maximum(1e-3 * weights, _SMALLEST_WEIGHT * present)
     moved = np.maximum(moved, floor)
     return np.asarray(moved / moved.sum(axis=-1, keepdims=True))
@@ -479,13 +508,16 @@ def _newton_step(
 def _factor_sum(
     total: Array, identity_weight: Array, weights: Array, roots: Array
 ) -> Array:
-    """Cholesky factor of c I + Σ ω_b G_bᵀ G_b, which is `total`.
+    """Cholesky factor of c I + Σ ω_b G_bᵀ G_b, which is `total` (..., d, d).
 
-    From the G_b themselves where rounding has spoilt their squares.
+    c is the `identity_weight` (..., 1, 1), ω_b are the `weights` (..., S) and G_b the `roots`
+    (..., S, d, d). The factor comes from the G_b themselves where rounding has spoilt their
+    squares.
     """
     try:
         return cholesky(total)
     except np.linalg.LinAlgError:
+        # The sum is Aᵀ A for the rows √c I and √ω_b G_b of A.
         d = roots.shape[-1]
         stacked = np.sqrt(weights)[..., None, None] * roots
         stacked = stacked.reshape(*stacked.shape[:-3], -1, d)

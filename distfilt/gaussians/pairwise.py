@@ -110,17 +110,20 @@ def intersect_inverses(
 
     def size(weights: Array) -> Array:
         """Return tr P or log det P but for a constant, for weights, both (..., points)."""
+        # The variances in the common coordinates, (..., points, d)
         p = np.stack([variances(w) for w in np.moveaxis(weights, -1, 0)], axis=-2)
         if rule == "min_trace":
             return np.asarray((scale[..., None, :] * p).sum(axis=-1))
         # log det P = Σ log p_k + 2 log |det T|
         return np.asarray(np.log(p).sum(axis=-1))
 
+    # The given ω, or the one whose result has the least size
     weight = _choose_weight(omega, size, d.shape[:-1])
     p = variances(weight)
     w = weight[..., None]
     # The gain of b: P (P_b⁻¹ - (1 - ω) (ω P_a + (1 - ω) P_b)⁻¹)
     gain = p * (1 / d - (1 - w) / (w + (1 - w) * d))
+    # m = m_a + T (gain z) and P = T diag(p) Tᵀ
     return _transform_back(common.transform, mean_a, gain * common.difference, p)
 
 
@@ -164,6 +167,7 @@ def intersect_ellipsoids(
     # the gain of b is 1 where D < I, and 0 where D > I.
     gain = np.where(np.abs(d - 1) < _TIE, 0.5, (d < 1).astype(np.float64))
     shift = gain * common.difference
+    # m = m_a + T (shift) and P = T min(I, D) Tᵀ
     return _transform_back(common.transform, mean_a, shift, np.minimum(1.0, d))
 
 
@@ -252,6 +256,7 @@ def intersect_split(
                 values.append((root**2).sum(axis=(-2, -1)))
         return np.stack(values, axis=-1)
 
+    # The given ω, or the one whose result has the least size
     weight = _choose_weight(omega, size, leading)
     # The gains K = P A⁻¹ and L = P B⁻¹, which add up to I
     a, b = informations(weight)
@@ -259,7 +264,7 @@ def intersect_split(
     gain_a = solve_definite(total, a)
     gain_b = solve_definite(total, b)
     mean = mean_a + (gain_b @ (mean_b - mean_a)[..., None])[..., 0]
-    # P = K A Kᵀ + L B Lᵀ, of which K I_a Kᵀ + L I_b Lᵀ is independent.
+    # P = K A Kᵀ + L B Lᵀ = (A⁻¹ + B⁻¹)⁻¹, of which K I_a Kᵀ + L I_b Lᵀ is independent.
     independent = (
         gain_a @ independent_a @ gain_a.mT + gain_b @ independent_b @ gain_b.mT
     )
@@ -312,12 +317,13 @@ def unite_gaussians(
     square = difference[..., :, None] * difference[..., None, :]
 
     def cover(weight: Array) -> Array:
-        """Return a factor of the smallest covariance above both, (..., d, d)."""
-        # The two on the right of the inequalities.
+        """Return a factor of the smallest covariance above both, (..., d, d), for weights (...)."""
+        # P_a + (m - m_a)(m - m_a)ᵀ and P_b + (m - m_b)(m - m_b)ᵀ for the mean m at ω, the weight;
+        # `square` is (m_b - m_a)(m_b - m_a)ᵀ.
         w = weight[..., None, None]
         first = cov_a + w**2 * square
         second = cov_b + (1 - w) ** 2 * square
-        # In the coordinates common to both they are I and D. Means do not matter here.
+        # In the coordinates z = T⁻¹ x they are I and D. Means do not matter here: any will do.
         common = _diagonalise(difference, first, difference, second)
         # P = T max(I, D) Tᵀ
         std = np.sqrt(np.maximum(1.0, common.variances_b))
@@ -325,12 +331,14 @@ def unite_gaussians(
 
     def size(weights: Array) -> Array:
         """Return tr P or half of log det P, (..., points), for weights (..., points)."""
+        # A factor F of P for each point, (..., points, d, d)
         factors = np.stack([cover(w) for w in np.moveaxis(weights, -1, 0)], axis=-3)
         if rule == "min_trace":
             # tr F Fᵀ = |F|²
             return np.asarray((factors**2).sum(axis=(-2, -1)))
         return np.asarray(np.linalg.slogdet(factors).logabsdet)
 
+    # The given ω, or the one whose result has the least size
     weight = _choose_weight(omega, size, leading)
     factor = cover(weight)
     return mean_a + weight[..., None] * difference, symmetrise(factor @ factor.mT)
@@ -359,7 +367,10 @@ class _CommonCoordinates(NamedTuple):
 def _diagonalise(
     mean_a: Array, cov_a: Array, mean_b: Array, cov_b: Array
 ) -> _CommonCoordinates:
-    """Return the coordinates in which both covariances are diagonal, that of a the identity."""
+    """Return the coordinates in which both covariances are diagonal, that of a the identity.
+
+    Means are (..., d) and covariances (..., d, d); leading axes broadcast.
+    """
     leading = _broadcast_pair(mean_a, cov_a, mean_b, cov_b)
     size = cov_a.shape[-1]
     lower = np.broadcast_to(cholesky(cov_a), (*leading, size, size))
@@ -401,6 +412,7 @@ def _choose_weight(
     high = 1 - low
     for _ in range(_STAGES):
         points = low[..., None] + (high - low)[..., None] * fractions
+        # The best of the points, for each pair of Gaussians
         best = size(points).argmin(axis=-1)
         centre = np.take_along_axis(points, best[..., None], axis=-1)[..., 0]
         # The next interval reaches from the neighbour on the left to that on the right.

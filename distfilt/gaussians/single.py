@@ -150,7 +150,8 @@ def innovation_moments(
         index = np.nonzero(np.broadcast_to(missing, shape))
         cross = np.broadcast_to(cross, (*shape, cross.shape[-1])).copy()
         cross[index] = 0.0
-        # Rows and columns of the missing components.
+        # Rows and columns of the missing components (columns are rows of the transposed view), and
+        # their entries of the diagonal, whose column is the row, the last part of the index.
         innovation_cov[index] = 0.0
         innovation_cov.mT[index] = 0.0
         innovation_cov[(*index, index[-1])] = 1.0
@@ -215,6 +216,7 @@ def unscented_points(
     offsets = math.sqrt(d + kappa) * root.mT
     zero = 0 * offsets[..., :1, :]
     offsets = np.concatenate([zero, offsets, -offsets], axis=-2)
+    # A copy, since all callers share the cached weights.
     return mean[..., None, :] + offsets, make_unscented_weights(d, kappa).copy()
 
 
@@ -227,5 +229,6 @@ def make_unscented_weights(d: int, kappa: float) -> Array:
     """
     weights = np.full(2 * d + 1, 0.5 / (d + kappa))
     weights[0] = kappa / (d + kappa)
+    # Read-only, since all callers share the cached array.
     weights.setflags(write=False)
     return weights

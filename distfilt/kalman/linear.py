@@ -128,10 +128,12 @@ def kalman_filter(
     >>> run.means.ravel().round(4)
     array([0.7143, 0.7143, 1.5263])
     """
+    # All runs in one axis: observations (T, R, m), means (R, d) and covariances (R, d, d).
     flat = flatten_runs(mean, cov, observations)
     y = flat.observations
     x = flat.means
     p = flat.covs
+    # One matrix for each of T steps
     f, h, q, r = repeat_per_step(len(y), F=F, H=H, Q=Q, R=R)
     # A contiguous copy is faster in the loop.
     f_transposed = np.ascontiguousarray(f.mT)
@@ -167,6 +169,7 @@ def kalman_filter(
         raise np.linalg.LinAlgError(
             "kalman_filter: a mean overflowed; rescale F, H, Q or R"
         )
+    # Columns become rows.
     return unflatten_runs(means.mT, covs, log_likelihood, flat.runs)
 
 
@@ -314,6 +317,7 @@ def flatten_runs(mean: Array, cov: Array, observations: Array) -> FlatRuns:
     # Run axes that only the prior has come first, after the time.
     new_axes = len(runs) - (observations.ndim - 2)
     y = np.expand_dims(observations, tuple(range(1, 1 + new_axes)))
+    # All axes of runs become one.
     y = np.broadcast_to(y, (steps, *runs, m)).reshape(steps, size, m)
     x = np.broadcast_to(mean, (*runs, d)).reshape(size, d)
     p = np.broadcast_to(cov, (*runs, *cov.shape[-2:])).reshape(size, *cov.shape[-2:])
@@ -368,6 +372,7 @@ def prepend_prior_time(times: Array, observations: Array, sensor: Sensor) -> Arr
     if times.min(initial=np.inf) <= 0:
         raise ValueError(f"times must be after 0, got {format_number(times[0])}")
     warn_of_clock(start=0.0, times=times, name="times")
+    # Angles are off by a few turns at most, if they are in rad.
     if sensor.wraps and observations.size:
         turns = count_turns(sensor, np.nan_to_num(observations.reshape(-1, sensor.dim)))
         if turns > 4:

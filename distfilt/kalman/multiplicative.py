@@ -206,17 +206,17 @@ def mekf(
         raise ValueError(
             f"chart must have {model.dim} components, like the model, got {chart.dim}"
         )
-    # Each step begins at the time of the last observation, the first at 0.
+    # The first step begins at 0. All R runs in one axis: y (T, R, m), x (R, d) and p (R, k, k).
     clock = prepend_prior_time(times, observations, sensor)
     runs, y, x, p = flatten_runs(mean, cov, observations)
     k = chart.error_dim
     means = np.empty((len(y), *x.shape))
     covs = np.empty((len(y), *p.shape))
     log_likelihood = np.empty(y.shape[:2])
+    # A part is a sensor with its columns of y. One of increments compares the present state with
+    # that of its last observation, at first the prior. The errors of those earlier states are
+    # estimated too, behind the present ones; at the start they are equal, so are all blocks of P.
     parts = _list_parts(sensors, y)
-    # A sensor of increments compares the present state with the one at its last observation, and
-    # at first with the prior. The errors of those earlier states are estimated too, behind the
-    # present ones. At the start all are the same state, so all blocks of P are equal.
     increments = [part for part in parts if part.sensor.uses_previous]
     previous = [x] * len(increments)
     n_blocks = 1 + len(increments)
@@ -225,9 +225,9 @@ def mekf(
     for n, t in enumerate(times):
         dt = t - clock[n]
         try:
+            # Means, the covariance of all errors, y - h(x) (NaN if not observed or not predicted)
             forecast, joint = _predict(x, p, chart, model, clock[n], dt)
             innovation = _find_innovation(forecast, previous, y[n], parts, sensor)
-            # Observed, but not predicted.
             has_unseen |= bool((np.isnan(innovation) & ~np.isnan(y[n])).any())
             slope = _error_jacobian(forecast, joint, previous, parts, chart)
             analysis = _assimilate(
@@ -277,8 +277,10 @@ def _list_parts(sensors: Sequence[Sensor], y: Array) -> list[_Part]:
             waiting = [*sensor.h.keywords["sensors"], *waiting]
             continue
         n = sensor.dim
+        # Whether components of this sensor are missing at different times
         present = ~np.isnan(y[..., start : start + n])
         differs_within = (present != present[..., :1]).any()
+        # Then each component is a part by itself.
         size = 1 if differs_within and sensor.uses_previous else n
         for row in range(0, n, size):
             rows = slice(row, row + size)
@@ -294,7 +296,8 @@ def _predict(
     """Forecast means (R, d) and the covariances (R, K, K) of their errors and of earlier ones.
 
     Behind the k present errors stand those of the states with which sensors of increments compare,
-    k for each: these states do not change. `t` and `dt` are start and length of the step.
+    k for each: these states do not change. `t` and `dt` are start and length of the step. The chart
+    says which components of the state are a quaternion.
     """
     k = chart.error_dim
     forecast = model.step(x, t, dt)
@@ -327,7 +330,9 @@ def _find_innovation(
     """Return the observations (R, m) minus their predictions, wrapped as `sensor` wraps them.
 
     `previous` has the states (R, d) with which the parts of increments compare, in their order.
+    `forecast` has the present states (R, d).
     """
+    # Each part of increments takes the next earlier state.
     next_previous = iter(previous)
     predicted = []
     for part in parts:
@@ -368,6 +373,7 @@ def _assimilate(
     # Missing components have no innovation and no row in H.
     innovation = np.where(missing, 0.0, innovation)
     h = np.where(missing[..., None], 0.0, slope)
+    # The mean errors, (R, K, 1), their covariance, and the innovations' densities, (R, 1)
     changes, cov, log_densities = assimilate(
         cov, innovation[..., None], h, sensor.noise_cov, missing
     )
@@ -390,6 +396,8 @@ def _replace_previous(
 
     Returns the states (R, d) with which each compares, and the covariance (R, K, K) of the present
     and those states' errors: where a state is replaced, its rows and columns become the present's.
+    The arguments are the present states x (R, d), the earlier ones, the covariance p, and the
+    observations y (R, m), which are NaN where missing.
     """
     if not increments:
         return previous, p
@@ -403,6 +411,7 @@ def _replace_previous(
         is_observed = ~np.isnan(y[:, part.columns][:, 0])
         source[is_observed, j * k : (j + 1) * k] = np.arange(k)
         replaced.append(np.where(is_observed[:, None], x, previous[j - 1]))
+    # Rows and columns of each run's P
     run = np.arange(n_runs)[:, None, None]
     return replaced, p[run, source[:, :, None], source[:, None, :]]
 
@@ -423,18 +432,22 @@ def _error_jacobian(
 ) -> Array:
     """Derivative of the observations in the present and the earlier errors, (R, m, K).
 
-    By the chain rule it is the sensor's Jacobian times the tangent basis, H B(x).
+    By the chain rule it is the sensor's Jacobian times the tangent basis, H B(x). Present states x
+    are (R, d), `previous` are those with which the parts of increments compare, and the covariance
+    of all errors is (R, K, K), k for each state.
     """
     basis = chart.tangent_basis(x)
     # The present errors come first in the joint covariance.
     k = chart.error_dim
     std = deviations(basis @ cov[..., :k, :k] @ basis.mT)
+    # The parts stand side by side, so that the last one ends behind all observations.
     n_observed = parts[-1].columns.stop
     slope = np.zeros((len(x), n_observed, cov.shape[-1]))
     # Number of parts of increments so far; the errors of their earlier states are blocks 1, 2, ...
     j = 0
     for sensor, rows, columns in parts:
         earlier_state = previous[j] if sensor.uses_previous else None
+        # By the present errors, and below by those of the earlier state
         present = sensor.jacobian(x, earlier_state, std=std) @ basis
         slope[:, columns, :k] = present[:, rows]
         if earlier_state is None:

@@ -223,7 +223,8 @@ def filterpy_ukf(
     filterpy = import_optional("filterpy.kalman", "reference")
 
     def make() -> _Filterpy:
-        # α = 1, β = 0, κ = 1: the weights of all points are positive.
+        # α = 1, β = 0, κ = 1: the weights of all points are positive. The step's length, model and
+        # sensor (dt, fx, hx) are given with each call below.
         points = filterpy.MerweScaledSigmaPoints(
             model.dim, alpha=1.0, beta=0.0, kappa=1.0
         )
@@ -284,7 +285,10 @@ def _unwrap(
 def _stack_sensors(
     sensors: Sequence[Sensor], times: Array, observations: Array
 ) -> tuple[Sensor, Array]:
-    """Stack sensors of the present state; the T + 1 times of the prior and the observations."""
+    """Stack sensors of the present state; the T + 1 times of the prior and the observations.
+
+    The times are (T,), the observations (T, ..., m) those of all sensors side by side.
+    """
     sensor = stack(sensors)
     if sensor.uses_previous:
         raise ValueError(
@@ -302,7 +306,8 @@ def _run_filterpy(
 ) -> FilterResult:
     """Filter every run by a filter of filterpy of its own, step after step.
 
-    `make` returns a new filter, and `step` moves it by one observation time.
+    `make` returns a new filter, and `step` moves it by one observation time. Mean (..., d),
+    covariance (..., d, d) and observations (T, ..., m) are those of all runs.
     """
     # Runs one after the other: filterpy has no batches.
     flat = flatten_runs(mean, cov, observations)
@@ -319,6 +324,7 @@ def _run_filterpy(
         kf.x = x[run].copy()
         kf.P = p[run].copy()
         for k, z in enumerate(y[:, run]):
+            # Forecast to time k, and update by the components that are not missing.
             present = ~np.isnan(z)
             step(kf, k, z, present)
             means[k, run] = kf.x

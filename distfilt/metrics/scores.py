@@ -213,6 +213,7 @@ def crps(
         w = np.full((n, 1), 1 / n)
     else:
         broadcast_leading(errors.shape[:-2], weights.shape[:-1], "weights")
+        # Errors in ascending order, and each one's weight beside it
         order = np.argsort(errors, axis=-2)
         errors = np.take_along_axis(errors, order, axis=-2)
         columns = np.broadcast_to(weights[..., None], errors.shape)

@@ -46,6 +46,8 @@ def propagate_mixture(
     >>> after.means, after.covs.round(6)  # E x² = 1.25, and its variance 4 m² P + 2 P²
     (array([[1.25]]), array([[[1.125]]]))
     """
+    # Values (L, 2d + 1, m) at 2d + 1 points around the mean of each of the L components; from them
+    # means and divided differences.
     values = np.asarray(call_user(function, _place_points(mixture)))
     differences = _take_differences(values)
     is_finite = [np.isfinite(part).all() for part in differences]
@@ -65,6 +67,8 @@ def propagate_together(
 ) -> list[GaussianMixture]:
     """Propagate several mixtures of one dimension as :func:`propagate_mixture`, in one call.
 
+    The function leads from (..., d) to (..., m), and the noise has the root (m, k).
+
     >>> two = [GaussianMixture.gaussian([m], [[0.25]]) for m in (1.0, 2.0)]
     >>> after = propagate_together(two, lambda x: 2 * x, np.zeros((1, 1)))
     >>> [mixture.means.ravel() for mixture in after]
@@ -72,6 +76,7 @@ def propagate_together(
     """
     # Each component moves by itself, so that those of all mixtures may be taken for one.
     after = propagate_mixture(_join(mixtures), function, noise_factor)
+    # Means, covariances and their Cholesky factors, each cut into one part for every mixture.
     parts = [
         divide_among(values, mixtures)
         for values in (after.means, after.covs, after.factors)
@@ -147,6 +152,9 @@ def update_together(
 ) -> list[GaussianMixture]:
     """Condition several mixtures of one dimension on one observation as :func:`update_mixture`.
 
+    The observation is (m,), with NaN where missing, and its noise has the covariance (m, m). The
+    options are those of :func:`update_mixture`.
+
     >>> two = [GaussianMixture.gaussian([m], [[1.0]]) for m in (0.0, 2.0)]
     >>> after = update_together(two, np.ones(1), lambda x: x, np.eye(1))
     >>> [mixture.means.ravel().round(6) for mixture in after]
@@ -171,11 +179,13 @@ def update_together(
     factors = _combine_roots(
         mixture.factors - gain @ first, gain @ second, gain @ noise_factor
     )
+    # Each of the four arrays is cut into one part for every mixture.
     parts = [
         divide_among(values, mixtures)
         for values in (innovation.values, root, gain, factors)
     ]
     updated = []
+    # `of_mixture` holds one mixture's innovations, roots, gains and factors.
     for one, *of_mixture in zip(mixtures, *parts, strict=True):
         updated.append(_update_means_and_weights(one, *of_mixture))
     return updated
@@ -190,14 +200,19 @@ def _update_means_and_weights(
 ) -> GaussianMixture:
     """Return the mixture of updated components, with weights by N(innovation; 0, S).
 
-    `root` (L, k, k) is a triangular root of S, and `gain` (L, d, k).
+    For L components and k observed numbers, innovations are (L, k); `root` (L, k, k) is a
+    triangular root of the innovations' covariances S, and `gain` is (L, d, k). `factors` (L, d, d)
+    are Cholesky factors of the updated covariances.
     """
-    # In memory as those of one mixture alone, so that the sum is rounded alike.
+    # The innovations may be a part of a larger array. A copy, with the strides of an array of this
+    # mixture alone, makes the sums below run in the same order, and so be rounded alike.
     innovations = innovations.copy("K")
     means = mixture.means + (gain @ innovations[..., None])[..., 0]
+    # log N(innovation; 0, S) = -½ (|root⁻¹ innovation|² + log|S| + k log 2π)
     squared_lengths = quadratic_form(root, innovations)
     size = innovations.shape[-1]
     logs = -0.5 * (squared_lengths + log_det(root) + size * _LOG_2PI)
+    # A component that cannot predict the observation gets no weight.
     logs = np.where(np.isfinite(logs), mixture.log_weights + logs, -np.inf)
     if not np.isfinite(logs.max()):
         raise ValueError(
@@ -205,6 +220,7 @@ def _update_means_and_weights(
         )
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
+    # The lightest components are left out.
     large = weights > _NEGLIGIBLE
     weights = weights[large] / weights[large].sum()
     return _build_from_factors(weights, means[large], factors[large])
@@ -242,6 +258,7 @@ def within_gate(
     innovation = _find_innovations(
         mixture, observed, function, noise, residual, on_branch
     )
+    # Squared Mahalanobis distances (L,) from the components' predictions
     squared_distances = quadratic_form(innovation.root(), innovation.values)
     squared_distances = np.where(mixture.weights > 0, squared_distances, np.nan)
     # Distances are NaN for components that predict nothing.
@@ -278,12 +295,15 @@ def _find_innovations(
 ) -> _Innovations:
     """Compare the observed components with their predictions by each component of the mixture.
 
-    The arguments are those of :func:`update_mixture`.
+    The arguments are those of :func:`update_mixture`. The observation is (m,), and its noise has
+    the covariance (m, m).
     """
     missing = np.isnan(observed)
+    # Indices of the observed components
     present = np.flatnonzero(~missing)
     # A residual may need every component; those that are missing are zeros in both.
     y = np.where(missing, 0.0, observed)
+    # Predictions (L, 2d + 1, m) at the points of each component, the first of them its mean
     predicted = call_user(function, _place_points(mixture))
     predicted = np.where(missing, 0.0, predicted)
     # Relative to the prediction at the mean, so that angles do not wrap between points.
@@ -291,6 +311,7 @@ def _find_innovations(
     at_means = np.broadcast_to(at_mean[:, None], predicted.shape)
     compare = np.subtract if on_branch else residual
     relative = call_user(compare, predicted, at_means)[..., present]
+    # The mean, and the columns of a root of the covariance, of the predictions
     spread = _take_differences(relative)
     difference = call_user(residual, np.broadcast_to(y, at_mean.shape), at_mean)
     return _Innovations(
@@ -305,6 +326,7 @@ def _join(mixtures: Sequence[GaussianMixture]) -> GaussianMixture:
     """Return the components of several mixtures as those of one, whose weights do not matter."""
     if len(mixtures) == 1:
         return mixtures[0]
+    # Computes the Cholesky factors of all covariances in one call.
     factor_together(mixtures)
     return GaussianMixture.construct(
         np.concatenate([mixture.weights for mixture in mixtures]),
@@ -316,7 +338,7 @@ def _join(mixtures: Sequence[GaussianMixture]) -> GaussianMixture:
 
 def _place_points(mixture: GaussianMixture) -> Array:
     """Points (L, 2d + 1, d) at distance √3 standard deviations from the means."""
-    # √(d + κ) is the distance.
+    # Unscented points lie at √(d + κ) standard deviations.
     kappa = _SQUARED_STEP - mixture.dim
     points, _weights = unscented_points(mixture.means, mixture.factors, kappa=kappa)
     return points

@@ -92,6 +92,7 @@ def jeffreys_of_many(
     functions = [log_p]
     functions.extend(log_qs)
     n = len(functions)
+    # Points and weights of the trapezoid rule, for the first axis and for the others
     first_axis, first_weights = _tensor_grid(lower[:1], upper[:1], nodes)
     points, weights = _tensor_grid(lower[1:], upper[1:], nodes)
     # Of each density f: its mass, and its integrals of log p - log q for all q.
@@ -128,6 +129,7 @@ def _evaluate_all(functions: Sequence[Callable[[Array], Array]], x: Array) -> Ar
 def _tensor_grid(low: Array, high: Array, nodes: int) -> tuple[Array, Array]:
     """Points (nodes^d, d) of the trapezoid rule on a box from `low` to `high` (d,), and weights."""
     d = low.size
+    # The number of each point's node along each axis, (nodes^d, d)
     index = np.indices((nodes,) * d).reshape(d, nodes**d).T
     step = (high - low) / (nodes - 1)
     # The nodes at both ends of an axis count half.
@@ -179,6 +181,7 @@ def jeffreys_by_sampling(
     p = check_array(call_user(log_p, x), "log_p", log_proposal.shape)
     q = check_array(call_user(log_q, x), "log_q", log_proposal.shape)
     ratio = p - q
+    # Weights with mean one, so that expectations are means
     p_weights = _importance_weights(p - log_proposal)
     q_weights = _importance_weights(q - log_proposal)
     p_mean = float((p_weights * ratio).mean())

@@ -100,6 +100,7 @@ def fuse_moments(
     >>> fuse_moments(prior, GaussianMixture.gaussian([3.0], [[1.0]])).means.round(6)
     array([[2.]])
     """
+    # PartialFusion checks the beliefs, and makes a tuple of a single one too.
     others = PartialFusion(prior, received, omega=omega).others
     gaussians = [other.moment_match() for other in others]
     # Of Gaussians the fused density is one component, without approximation.
@@ -140,7 +141,9 @@ def fuse_sequentially(
     array([[3.75]])
     """
     fused = prior
+    # PartialFusion checks the beliefs, and makes a tuple of a single one too.
     for m, other in enumerate(PartialFusion(prior, received).others, start=1):
+        # The only string is "equal".
         exponent = m / (m + 1) if isinstance(omega, str) else omega
         fused = call_user(pair, fused, other, omega=exponent)
     return fused
@@ -169,6 +172,7 @@ def average_mixtures(
     >>> average_mixtures(prior, GaussianMixture.gaussian([2.0], [[1.0]])).mean
     array([1. , 0.5])
     """
+    # The prior's marginal of the target t, the first n of its d components; the others are e.
     target = PartialFusion(prior, received).target
     n = received.dim
     dim = prior.dim
@@ -177,7 +181,9 @@ def average_mixtures(
     shares = np.exp(logs - log_sum_exp(logs))
 
     # Each received component meets each component's p(e | t): one joint Gaussian a pair.
+    # The gains of e on t, (L, d - n, n), and the covariances of e given t.
     gain, conditional = regression(prior, n)
+    # Means (L', L, d) of L' received and L prior components: e moves with t by the gain.
     differences = received.means[:, None] - prior.means[:, :n]
     ego_means = prior.means[:, n:] + (gain @ differences[..., None])[..., 0]
     target_means = np.broadcast_to(received.means[:, None], differences.shape)
@@ -186,6 +192,7 @@ def average_mixtures(
     covs = covs.reshape(-1, dim, dim)
 
     weights = (received.weights[:, None] * shares).ravel() * (1 - omega)
+    # The prior's components with the weight ω, and these with 1 - ω
     positive = weights > 0
     return GaussianMixture.construct(
         np.concatenate([omega * prior.weights, weights[positive]]),
@@ -257,8 +264,10 @@ def target_fusion(
         mean = beliefs[agent].mean[:target_dim]
         received[agent] = [align_mixture(m, mean, periods) for m in of_agent]
     if fuse is fuse_mixtures:
+        # All agents in one call. If that fails, the loop below finds out which agent's fusion does.
         with suppress(np.linalg.LinAlgError):
             fused = _fuse_together(beliefs, targets, received)
+            # Raises the error if a covariance is not positive definite.
             factor_together(fused)
             return tuple(fused)
     # Agent by agent, so that an error names the agent.
@@ -301,7 +310,7 @@ def _fuse_together(
 
     The targets are the beliefs' marginals.
     """
-    # Each message once
+    # Each message once; their precisions are computed in one call.
     messages = {id(m): m for of_agent in received for m in of_agent}
     invert_together(list(messages.values()))
     # Receivers whose dimension, and whose messages, have the same sizes
@@ -310,6 +319,7 @@ def _fuse_together(
         sizes = tuple([m.n_components for m in of_agent])
         if sizes:
             alike.setdefault((beliefs[agent].dim, *sizes), []).append(agent)
+    # Agents that have received nothing keep their beliefs.
     fused = list(beliefs)
     for agents in alike.values():
         results = fuse_by_receiver(

@@ -223,11 +223,14 @@ class GaussianMixture(FrozenModel):
     @cached_property
     def _white_frame(self) -> _WhiteFrame:
         """The coordinates in which each component is a standard normal."""
+        # Points count from the mean c, since far from the origin differences would lose digits.
         centre = self.weights @ self.means
+        # C_l⁻¹ for the Cholesky factors C_l, and C_l⁻¹ (m_l - c)
         identity = np.broadcast_to(np.eye(self.dim), self.covs.shape)
         inverse_factors = np.linalg.solve(self.factors, identity)
         differences = self.means - centre
         white_means = (inverse_factors @ differences[..., None])[..., 0]
+        # The matrices C_l⁻ᵀ side by side, (d, L d), as an array of their own instead of a view
         columns = np.array(inverse_factors.reshape(-1, self.dim).T)
         return _WhiteFrame(centre, columns, white_means)
 
@@ -250,6 +253,7 @@ class GaussianMixture(FrozenModel):
             raise ValueError(
                 f"indices must be integers below {self.dim}, got {index.max()}"
             )
+        # Rows and columns of the chosen components, (L, n) and (L, n, n)
         means = self.means[:, index]
         covs = self.covs[:, index[:, None], index]
         return self.construct(self.weights, means, covs)
@@ -323,11 +327,13 @@ class GaussianMixture(FrozenModel):
         covs = np.empty((len(means), dim, dim))
         covs[:, rows, columns] = triangles
         covs[:, columns, rows] = triangles
+        # Copies, since a message's arrays may be shared by all that receive it.
         return cls.construct(weights.copy(), means.copy(), covs)
 
 
 def _describe_collapse(covs: Array) -> str:
     """Name the component whose covariance (L, d, d) has no Cholesky factor, and the usual cause."""
+    # Of correlations, which do not depend on units, in ascending order
     eigenvalues = np.linalg.eigvalsh(to_unit_variances(covs).correlation)
     worst = int(eigenvalues[:, 0].argmin())
     return (
@@ -355,12 +361,14 @@ def factor_together(mixtures: Sequence[GaussianMixture]) -> None:
     >>> [float(mixture.factors[0, 0, 0]) for mixture in two]
     [2.0, 3.0]
     """
+    # A cached property is stored among the attributes once it has been computed.
     new_by_dim: dict[int, list[GaussianMixture]] = {}
     for mixture in mixtures:
         if "factors" not in vars(mixture):
             new_by_dim.setdefault(mixture.dim, []).append(mixture)
     for new in new_by_dim.values():
         factors = np.linalg.cholesky(np.concatenate([mixture.covs for mixture in new]))
+        # Each mixture's part is stored as if its cached property had computed it.
         for mixture, part in zip(new, divide_among(factors, new), strict=True):
             vars(mixture)["factors"] = part
 
@@ -374,10 +382,12 @@ def invert_together(mixtures: Sequence[GaussianMixture]) -> None:
     [0.25, 4.0]
     """
     factor_together(mixtures)
+    # Cached properties are attributes once they have been computed.
     new = [mixture for mixture in mixtures if "precisions" not in vars(mixture)]
     if not new:
         return
     precisions = inverse(np.concatenate([mixture.factors for mixture in new]))
+    # Each mixture's part is stored as if its cached property had computed it.
     for mixture, part in zip(new, divide_among(precisions, new), strict=True):
         vars(mixture)["precisions"] = part
 
@@ -385,7 +395,7 @@ def invert_together(mixtures: Sequence[GaussianMixture]) -> None:
 def divide_among(
     values: NDArray[E], mixtures: Sequence[GaussianMixture]
 ) -> list[NDArray[E]]:
-    """Return the parts of values (ΣL, ...) that belong to each mixture's components, in order.
+    """Cut values of all components into the parts (L, ...) of each mixture's components, in order.
 
     >>> two = [GaussianMixture.gaussian([m], [[1.0]]) for m in (0.0, 3.0)]
     >>> divide_among(np.array([5.0, 7.0]), two)
@@ -423,7 +433,8 @@ def regression(mixture: GaussianMixture, n: int) -> tuple[Array, Array]:
 def assemble_joint(target: Array, gain: Array, conditional: Array) -> Array:
     """Assemble covariances of [t; e], (..., d, d), from P_tt, the gain G of e on t, and P_e|t.
 
-    :func:`regression` gives G and P_e|t of a prior, of which only P_tt has changed.
+    :func:`regression` gives G and P_e|t of a prior, of which only P_tt has changed. Shapes are
+    (..., n, n) of P_tt, (..., d - n, n) of the gain, and (..., d - n, d - n) of P_e|t.
     """
     # P_et = G P_tt and P_ee = P_e|t + G P_tt Gᵀ
     ego = symmetrise(conditional + gain @ target @ gain.mT)

@@ -37,9 +37,11 @@ def loop_costs(
 ) -> Array:
     """As :func:`pair_costs`, for numba: form and factor each merged covariance in one pass.
 
-    With loops over its entries, which numba compiles, no intermediate arrays are made.
+    With loops over its entries, which numba compiles, no intermediate arrays are made. Weights w
+    (L,), means m (L, d) and covariances p (L, d, d) are those of all components.
     """
     d = m.shape[1]
+    # The Cholesky factor of the merged covariance, and the costs; a pair without weight costs 0.
     lower = np.empty((d, d))
     costs = np.zeros(others.size)
     for k, j in enumerate(others):
@@ -114,6 +116,7 @@ def merge_pairs(w: Array, m: Array, p: Array, n_components: int) -> Mask:
         p[i] = a * p[i] + (1 - a) * p[j] + spread
         m[i] = a * m[i] + (1 - a) * m[j]
         w[i] = total
+        # Component j is gone, and its costs are infinite.
         w[j] = 0.0
         remaining[j] = False
         best[j] = np.inf

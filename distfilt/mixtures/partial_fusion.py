@@ -93,12 +93,14 @@ class PartialFusion(FrozenModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # Beliefs about the target have as many components as the target, at most the whole state.
         dims = {other.dim for other in self.others}
         if len(dims) != 1 or max(dims) > self.prior.dim:
             raise ValueError(
                 f"received must have target beliefs, one or more, of one dimension, at most "
                 f"the prior's {self.prior.dim}, got {sorted(dims)}"
             )
+        # One exponent for each belief, if they are given one by one.
         n_beliefs = len(self.others) + 1
         if np.ndim(self.omega) and len(self.exponents) != n_beliefs:
             raise ValueError(
@@ -142,6 +144,8 @@ class PartialFusion(FrozenModel):
         """
         # log g(t) = (ω - 1) log p(t) + Σ ω_b log p_b(t)
         exponents = self.exponents
+        # Where a belief that divides and one that multiplies are zero, infinities cancel to NaN,
+        # which is refused below. An exponent of zero is left out: zero times infinity is NaN too.
         with np.errstate(invalid="ignore"):
             if exponents[0] != 1:
                 logs = logs + (exponents[0] - 1) * self.target.log_density(t)
@@ -208,6 +212,7 @@ class PartialFusion(FrozenModel):
                 "marginal must come with terms='all', since matched terms divide by the "
                 "prior's own components, got terms='matched'"
             )
+        # The beliefs by which the prior is divided and multiplied, all about the target
         divided = self.target if marginal is None else marginal
         factors = self.others if received is None else received
         n = self.target_dim
@@ -261,16 +266,19 @@ class PartialFusion(FrozenModel):
             return _weight_by_values(shapes.with_equal_weights(), logs)
         logs = self.log_value(shapes.means)
         mixture = shapes.with_equal_weights()
+        # The exact density, as its logarithm, is the value of each component at its own mean.
         if rule == "C2":
             return _weight_by_values(mixture, logs)
         if shapes.n_components > at_most:
-            # C2 weights a component by its value over its peak.
+            # C2 weights a component by its value over its peak; the largest weights come first.
             order = np.argsort(mixture.log_peaks - logs, kind="stable")
             largest = np.isin(np.arange(shapes.n_components), order[:at_most])
             shapes = shapes.select(largest)
             logs = logs[largest]
             mixture = shapes.with_equal_weights()
+        # Least-squares coefficients of components with the peak 1
         coefficients = self._collocate(mixture, logs, with_points=rule == "points")
+        # A coefficient of zero has the logarithm -inf, and so the weight zero.
         with np.errstate(divide="ignore"):
             return _weight_by_values(mixture, np.log(coefficients))
 
@@ -327,6 +335,7 @@ def _weight_by_values(mixture: GaussianMixture, logs: Array) -> GaussianMixture:
     """
     # w_s ∝ value_s / peak_s
     log_weights = logs - mixture.log_peaks
+    # The logarithm of the sum of the weights
     total = log_sum_exp(log_weights)
     if not np.isfinite(total).all():
         raise SolverError(
@@ -356,7 +365,9 @@ def _multiply_received(
         # Each component of this belief is added to every choice so far.
         precisions = exponent * other.precisions
         differences = other.means - centres[:, None]
+        # ω P_r⁻¹ (m_r - c_s) for each component r and centre s
         added = np.einsum("rij,srj->sri", precisions, differences)
+        # The axes of choices so far and of the components become one.
         information = information[:, :, None] + precisions
         information = information.reshape(n_centres, -1, n, n)
         vectors = vectors[:, :, None] + added[:, None]
@@ -375,13 +386,16 @@ def _fuse_components(
 
     The target part is updated with the information Λ and the vector η of
     :math:`p_p^{\omega-1}\prod_b p_b^{\omega_b}` in the frame that whitens it; e follows by
-    regression. `pairs` are the indices q and p, (Q,) each; with T products the result has up to
-    Q T components, those whose covariance is positive definite.
+    regression. `pairs` are the indices q and p, (Q,) each; with T products the result has up to Q T
+    components, those whose covariance is positive definite. The exponents are the prior's ω and the
+    ω_b of the received beliefs.
     """
     q, p = pairs
+    # Λ (Q, T, n, n) and η (Q, T, n)
     information, vectors = _update_information(
         prior, divided, received, exponents, pairs
     )
+    # A reduced marginal has fewer components: equal indices then mean nothing.
     is_matched = (q == p) & (len(divided.means) == prior.n_components)
     smallest_pivot = np.where(is_matched, _MATCHED_PIVOT, _UNMATCHED_PIVOT)
     means, covs, is_definite = _update_components(
@@ -397,7 +411,12 @@ def _update_information(
     exponents: Array,
     pairs: tuple[Indices, Indices],
 ) -> tuple[Array, Array]:
-    """Return the information Λ (Q, T, n, n) and vectors η (Q, T, n) by which components change."""
+    """Return the information Λ (Q, T, n, n) and vectors η (Q, T, n) by which components change.
+
+    Prior components q change by the product of received components and by division by components p
+    of `divided`. `pairs` are the indices q and p, (Q,) each; T is the number of choices of received
+    components. The exponents are the prior's ω and those of the received beliefs.
+    """
     n = divided.dim
     q, p = pairs
     # Vectors are relative to the prior component's mean: far from the origin they would cancel.
@@ -421,10 +440,12 @@ def _update_components(
 ) -> tuple[Array, Array, Mask]:
     """Return means (Q, T, d) and covariances of the updated components q, and which are definite.
 
-    The pivots (Q,) are those of `_factor_definite`.
+    `q` (Q,) are indices of prior components. By the information Λ (Q, T, n, n) and vectors η
+    (Q, T, n) the target, their first n numbers, changes in T ways. A covariance with a pivot below
+    the smallest one, (Q,), is not definite: see :func:`_factor_definite`.
     """
     n = vectors.shape[-1]
-    # P_tt = S (I + Sᵀ Λ S)⁻¹ Sᵀ with the prior's own P_tt = S Sᵀ.
+    # P_tt = S (I + Sᵀ Λ S)⁻¹ Sᵀ with the prior's own P_tt = S Sᵀ. The axis None is for the T ways.
     root = np.linalg.cholesky(prior.covs[q, :n, :n])[:, None]
     relative = np.eye(n) + root.mT @ symmetrise(information) @ root
     lower, is_definite = _factor_definite(relative, smallest_pivot[:, None])
@@ -432,7 +453,8 @@ def _update_components(
     half = np.linalg.solve(lower, np.broadcast_to(root.mT, lower.shape))
     target = half.mT @ half
 
-    # The target moves by P_tt η, and e by the gain times that.
+    # The target t moves by P_tt η, and the ego state e by the gain times that. The regression of e
+    # on t, its gain and the covariance of e given t, stays.
     gain, conditional = regression(prior, n)
     target_shift = (target @ vectors[..., None])[..., 0]
     ego_shift = (gain[q, None] @ target_shift[..., None])[..., 0]
@@ -446,6 +468,7 @@ def _select_definite(
     means: Array, covs: Array, q: Indices, is_definite: Mask
 ) -> ComponentShapes:
     """Return the shapes of the components that have a positive definite covariance."""
+    # `q` (Q,) is the prior component of each row; means and masks are (Q, T, ...).
     source = np.broadcast_to(q[:, None], is_definite.shape)
     return ComponentShapes.construct(
         means[is_definite],
@@ -471,11 +494,13 @@ def fuse_by_receiver(
     >>> [fused.means.ravel() for fused in after]
     [array([1.5]), array([1.5])]
     """
+    # The marginal is given, so that it is not computed again.
     fusions = [
         PartialFusion.construct(prior, tuple(others), target=target)
         for prior, target, others in zip(priors, targets, received, strict=True)
     ]
     invert_together(targets)
+    # Each receiver's information Λ and vectors η, with every component divided by itself.
     changes = []
     for fusion in fusions:
         index = np.arange(fusion.prior.n_components)
@@ -495,6 +520,8 @@ def fuse_by_receiver(
         np.concatenate([prior.covs for prior in priors]),
     )
     n_all = everyone.n_components
+    # Means, covariances, and whether these are positive definite, of each component and choice. As
+    # each is divided by its own marginal, only a pivot at the level of rounding is refused.
     means, covs, is_definite = _update_components(
         everyone,
         np.arange(n_all),
@@ -502,12 +529,14 @@ def fuse_by_receiver(
         np.concatenate([vectors for _, vectors in changes]),
         np.full(n_all, _MATCHED_PIVOT),
     )
+    # Back to one part for each receiver
     of_receivers = zip(
         divide_among(means, priors),
         divide_among(covs, priors),
         divide_among(is_definite, priors),
         strict=True,
     )
+    # Weights by the exact density, for one receiver after the other
     fused = []
     for fusion, (own_means, own_covs, own_definite) in zip(
         fusions, of_receivers, strict=True
@@ -615,6 +644,7 @@ def nonnegative_least_squares(
     singular_values = svdvals(matrix)
     # With fewer rows than unknowns the smallest singular value of MᵀM is zero.
     smallest = singular_values[-1] if n_rows >= n_unknowns else 0.0
+    # The smallest α that makes the problem well-conditioned; 0 if it is so already
     alpha = tikhonov(singular_values[0], smallest, condition=condition)
     if alpha > 0:
         # |M w - r|² + α² |w|² is the least-squares problem of stacked rows.

@@ -165,7 +165,9 @@ def runnalls(
         mixture = _absorb_into_heaviest(mixture, heaviest)
     if mixture.n_components <= n_components:
         return mixture
+    # In coordinates in which all numbers are of the order of one; the costs are the same there.
     white = _whiten(mixture)
+    # Merges the arrays in place; `remaining` (L,) marks the components that are left.
     remaining = merge_pairs(white.weights, white.means, white.covs, n_components)
     # Back from the whitened frame.
     root = white.root
@@ -187,9 +189,11 @@ def merge_costs(mixture: GaussianMixture) -> Array:
     >>> merge_costs(two)[0, 1].round(6) == np.round(0.5 * np.log(2), 6)
     np.True_
     """
+    # In coordinates in which all numbers are of the order of one; the bounds are the same there.
     white = _whiten(mixture)
     log_dets = np.linalg.slogdet(white.covs).logabsdet
     index = np.arange(mixture.n_components)
+    # Row i: the bounds B_ij for all j.
     rows = []
     for i in range(mixture.n_components):
         costs = pair_costs(white.weights, white.means, white.covs, log_dets, i, index)
@@ -256,6 +260,7 @@ def merge_irrelevant(
     ... ).n_components
     3
     """
+    # Divergence of each component from the nearest one of the other mixture, (L,)
     nearest = gaussian_divergences(mixture, other).min(axis=1)
     # δ_q; a component without weight must not set the least, and is not merged.
     delta = np.where(mixture.weights > 0, mixture.weights * nearest, np.inf)
@@ -308,6 +313,7 @@ def pivoted_qr(
     if rest == "drop":
         return selected
     merged = shapes.select(~is_selected).with_equal_weights()
+    # The merged component takes the source of the largest pivot among those it replaces.
     return ComponentShapes.construct(
         np.concatenate([selected.means, merged.mean[None]]),
         np.concatenate([selected.covs, merged.cov[None]]),
@@ -324,7 +330,8 @@ def gaussian_divergences(mixture: GaussianMixture, other: GaussianMixture) -> Ar
         +\log|\mathbf P_r|-\log|\mathbf P_q|\\
         &\qquad+(\mathbf m_q-\mathbf m_r)^\top\mathbf P_r^{-1}(\mathbf m_q-\mathbf m_r)\bigr]
 
-    never negative: values that rounding leaves below zero are zero.
+    never negative: values that rounding leaves below zero are zero. The first index is that of the
+    mixture's components q, the second that of the other's r. Means are (d,), covariances (d, d).
     """
     d = mixture.dim
     if other.dim != d:
@@ -352,9 +359,11 @@ def _absorb_into_heaviest(mixture: GaussianMixture, n_heaviest: int) -> Gaussian
     order = np.argsort(-white.weights, kind="stable")
     heavy = order[:n_heaviest]
     log_dets = np.linalg.slogdet(white.covs).logabsdet
+    # A label for each group of components that become one
     labels = np.empty(order.size, dtype=np.intp)
     labels[heavy] = np.arange(n_heaviest)
     for i in order[n_heaviest:]:
+        # Runnalls' bounds of a merger with each of the heaviest
         costs = pair_costs(white.weights, white.means, white.covs, log_dets, i, heavy)
         labels[i] = costs.argmin()
     return _merge_groups(mixture, labels)
@@ -415,6 +424,7 @@ def _merge_groups(mixture: GaussianMixture, labels: Indices) -> GaussianMixture:
 
     The labels (L,) are 0, ..., G - 1, which are also the places of the groups in the result.
     """
+    # (G, L): which group has which component
     is_member = labels == np.arange(labels.max() + 1)[:, None]
     weights = is_member @ mixture.weights
     # Shares of a group's weight, (G, L); equal ones in a group without weight.

@@ -63,6 +63,7 @@ def split_library(*, std: Fraction = 0.7) -> tuple[Array, Array]:
     1.0
     """
     weights, means = _optimize_library(std)
+    # Copies, since all callers share the cached arrays.
     return weights.copy(), means.copy()
 
 
@@ -145,6 +146,7 @@ def split_gaussian(
     root = np.empty((d, d))
     root[order] = cholesky(cov[np.ix_(order, order)])
     root = root[:, : first.size]
+    # A mixture of so many Gaussians of one width, with mean 0 and variance 1
     line = _place_on_line(parts)
     # Every combination of means along the axes, with the product of their weights.
     n_axes = first.size
@@ -172,7 +174,7 @@ class _NormalMixture(NamedTuple):
 def _place_on_line(parts: int) -> _NormalMixture:
     """Return a mixture of so many equally wide Gaussians that approximates N(0, 1).
 
-    It has mean 0 and variance 1; :func:`split_gaussian` has its formula.
+    It has mean 0 and variance 1; :func:`split_gaussian` has its formula. `parts` is their number.
     """
     # With few means a wider reach would leave gaps between them.
     reach = 2.5 if parts <= 8 else 3.0
@@ -273,6 +275,7 @@ def split_components(
     >>> three.n_components, three.cov.round(12).tolist()
     (3, [[1.0, 0.0], [0.0, 1.0]])
     """
+    # Indices of the components, each once
     is_distinct = np.unique(which).size == which.size
     if not is_distinct or (which >= mixture.n_components).any():
         raise ValueError(
@@ -288,13 +291,15 @@ def split_components(
             "directions must be one standard deviation long, "
             f"got {np.sqrt(worst):.6g} standard deviations"
         )
-    # The pieces: weights w w_k, means m + m_k u, and covariances P - (1 - s²) u uᵀ.
+    # The library has weights w_k and means m_k, of three pieces with the deviation s. In place of a
+    # component come the weights w w_k, means m + m_k u, and covariances P - (1 - s²) u uᵀ.
     piece_weights, piece_means = _optimize_library(std)
     weights = mixture.weights[which][:, None] * piece_weights
     shifts = piece_means[:, None] * directions[:, None]
     means = mixture.means[which][:, None] + shifts
     products = (1 - std**2) * directions[:, :, None] * directions[:, None, :]
     covs = np.repeat(symmetrise(mixture.covs[which] - products), 3, axis=0)
+    # The components that stay come first.
     unsplit = np.setdiff1d(np.arange(mixture.n_components), which)
     return GaussianMixture.construct(
         np.concatenate([mixture.weights[unsplit], weights.ravel()]),

@@ -87,6 +87,7 @@ class AgentModels(Model):
                 raise InvalidArgumentError(
                     f"models must be a Model for each agent, got a {type(model).__name__}"
                 )
+        # The states must have the same components.
         first = models[0]
         for name in ("dim", "names", "units", "periods"):
             values = [getattr(model, name) for model in models]
@@ -126,14 +127,17 @@ class AgentModels(Model):
         self, x: Annotated[ArrayInput, "... self.dim"], t: float, dt: NonNegativeFloat
     ) -> Array:
         """Move states (..., A, ..., d) from `t` to `t` + `dt`, without noise."""
+        # Each agent's model and states, and the agents' inputs side by side if they move alike
         pairs = self._pair(x)
         team = self._team
         # The first time each agent moves alone, which checks its model.
         if team is None or needs_check(self, "step"):
             mark_checked(self, "step")
-            return self._stack([model.step(own, t, dt) for model, own in pairs])
-        own = np.moveaxis(x, self.agent_axis, 0)
-        moved = move_by_inputs(team.move, team.pieces(t, dt, own.ndim), own)
+            return self._stack([model.step(states, t, dt) for model, states in pairs])
+        agents_first = np.moveaxis(x, self.agent_axis, 0)
+        # The parts of the step in which one input of each agent holds
+        pieces = team.pieces(t, dt, agents_first.ndim)
+        moved = move_by_inputs(team.move, pieces, agents_first)
         return np.moveaxis(moved, 0, self.agent_axis)
 
     @validated
@@ -141,14 +145,15 @@ class AgentModels(Model):
         self, x: Annotated[ArrayInput, "... self.dim"], t: float, dt: NonNegativeFloat
     ) -> Array:
         """Covariance of the noise that a step from states (..., d) adds, (..., d, d)."""
+        # Each agent's model and states; agents that move alike are taken in one call.
         pairs = self._pair(x)
         if self._team is not None:
             return self._noise_of_team(self._team, x, t, dt)
         covs = []
-        for model, own in pairs:
-            cov = model.noise_at(own, t, dt)
+        for model, states in pairs:
+            cov = model.noise_at(states, t, dt)
             # A noise that does not depend on the state is the same for all.
-            covs.append(np.broadcast_to(cov, (*own.shape, self.dim)))
+            covs.append(np.broadcast_to(cov, (*states.shape, self.dim)))
         return self._stack(covs)
 
     @validated
@@ -162,7 +167,7 @@ class AgentModels(Model):
     ) -> Array:
         """Move states (..., d) from `t` to `t` + `dt`, each with a draw of its agent's noise."""
         pairs = self._pair(x)
-        moved = [model.sample_step(own, t, dt, rng=rng) for model, own in pairs]
+        moved = [model.sample_step(states, t, dt, rng=rng) for model, states in pairs]
         return self._stack(moved)
 
     @validated
@@ -178,19 +183,24 @@ class AgentModels(Model):
         if self._team is not None:
             # By differences of `step`, which moves all agents at once
             return super().jacobian(x, t, dt, std=std)
+        # Each agent's Jacobian, with the deviations of its own states
         slopes = []
-        for agent, (model, own) in enumerate(self._pair(x)):
-            own_std = None
+        for agent, (model, states) in enumerate(self._pair(x)):
+            agent_std = None
             if std is not None:
-                own_std = np.take(np.broadcast_to(std, x.shape), agent, self.agent_axis)
-            slopes.append(model.jacobian(own, t, dt, std=own_std))
+                stds = np.broadcast_to(std, x.shape)
+                agent_std = np.take(stds, agent, self.agent_axis)
+            slopes.append(model.jacobian(states, t, dt, std=agent_std))
         return self._stack(slopes)
 
     def _noise_of_team(self, team: _Team, x: Array, t: float, dt: float) -> Array:
         """Return the covariances of a step's noise for the agents of a team, like `noise_at`."""
-        own = np.moveaxis(x, self.agent_axis, 0)
-        input_cov = _insert_axes(team.input_covs, own.ndim + 1)
-        cov = add_up_noise(team.move, team.pieces(t, dt, own.ndim), own, input_cov)
+        agents_first = np.moveaxis(x, self.agent_axis, 0)
+        # Covariances (A, ..., k, k) of the inputs, for states (A, ..., d)
+        input_cov = _insert_axes(team.input_covs, agents_first.ndim + 1)
+        pieces = team.pieces(t, dt, agents_first.ndim)
+        cov = add_up_noise(team.move, pieces, agents_first, input_cov)
+        # Each model's noise beyond that of its inputs
         added = np.stack([model.Q(t, dt) for model in self.models])
         cov = cov + _insert_axes(added, cov.ndim)
         return np.moveaxis(cov, 0, self.agent_axis)
@@ -203,8 +213,8 @@ class AgentModels(Model):
                 f"x must have an axis {axis} of {self.n_agents} agents for a model of each, got "
                 f"shape {x.shape}"
             )
-        own = np.moveaxis(x, axis, 0)
-        return list(zip(self.models, own, strict=True))
+        agents_first = np.moveaxis(x, axis, 0)
+        return list(zip(self.models, agents_first, strict=True))
 
     def _stack(self, values: list[Array]) -> Array:
         """Return the agents' arrays as one, with their axis where the states have it."""
@@ -239,6 +249,7 @@ def _read_team(models: Sequence[Model]) -> _Team | None:
 
     Otherwise return None: each agent then has to be moved by itself.
     """
+    # A model with a derivative of its own is moved by itself.
     inputs = []
     moves = []
     for model in models:
@@ -246,11 +257,13 @@ def _read_team(models: Sequence[Model]) -> _Team | None:
             return None
         inputs.append(model.inputs)
         moves.append(model.driven_transition)
+    # All must move by one function, with as many inputs at the same times.
     first = inputs[0]
     for other, move in zip(inputs, moves, strict=True):
         is_alike = move is moves[0] and other.values.shape == first.values.shape
         if not is_alike or not np.array_equal(other.times, first.times):
             return None
+    # The agents' inputs side by side, (T, A k)
     values = np.concatenate([one.values for one in inputs], axis=1)
     # The covariance of these joint inputs is never used: each agent has its own, returned beside.
     n_values = values.shape[1]
@@ -264,6 +277,7 @@ def _read_team(models: Sequence[Model]) -> _Team | None:
 
 def _insert_axes(values: Array, ndim: int) -> Array:
     """Insert axes of size 1 behind the first, so that values (A, ...) have `ndim` axes."""
+    # Broadcasting then fits the axis of agents to the first one of states.
     missing = ndim - values.ndim
     return values.reshape(values.shape[0], *[1] * missing, *values.shape[1:])
 

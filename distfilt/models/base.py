@@ -110,8 +110,11 @@ class Model(FrozenModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # One entry for each component, or none at all. The dataclass is frozen, so that the field
+        # cannot be assigned to.
         periods = read_periods(self.periods, self.dim, self.names)
         object.__setattr__(self, "periods", periods)
+        # The functions must take these arguments.
         check_signature(self.transition, "transition", "x, t, dt")
         check_signature(self.noise_cov, "noise_cov", "t, dt")
         if self.derivative is not None:
@@ -154,10 +157,14 @@ class Model(FrozenModel):
     @validated
     def noise_sqrt(self, t: float, dt: NonNegativeFloat) -> Array:
         """Factor L of the noise covariance Q = L Lᵀ, (d, d), read-only."""
+        # The bytes of the covariance are the key by which its factor is cached.
         return _factor_noise(self._noise_cov(t, dt).tobytes(), self.dim)
 
     def _noise_cov(self, t: float, dt: float) -> Array:
-        """Return the noise covariance, checked and read-only."""
+        """Return the noise covariance, checked and read-only.
+
+        The step leads from t to t + dt; the covariance is (d, d).
+        """
         q = call_user(self.noise_cov, t, dt)
         # Whether it is finite and a covariance is checked once for each value.
         q = check_array(q, "noise_cov", (self.dim, self.dim), finite=False)
@@ -166,9 +173,11 @@ class Model(FrozenModel):
         is_trusted = is_of_library(self.noise_cov)
         is_plain = is_trusted or (self.dim > _SMALL and is_nonnegative_diagonal(q))
         if is_plain and all_finite(q):
+            # A copy, since the array may be the user's; read-only, since callers may keep it.
             q = q.copy()
             q.setflags(write=False)
             return q
+        # The bytes are the key under which a covariance that has been checked is cached.
         return _check_noise(q.tobytes(), self.dim)
 
     @validated
@@ -255,6 +264,7 @@ def _factor_noise(data: bytes, dim: int) -> Array:
     It is cached as in `_check_noise`, and apart from it, since only draws need the factor.
     """
     lower = factor(np.frombuffer(data).reshape(dim, dim))
+    # All callers share the cached array.
     lower.setflags(write=False)
     return lower
 
@@ -341,7 +351,10 @@ class LinearModel(Model):
         return self._compute_noise_cov(t, dt)
 
     def _compute_noise_cov(self, t: float, dt: float) -> Array:
-        """Compute what `_noise_cov` returns; once, check Φ against Q."""
+        """Compute what `_noise_cov` returns; once, check Φ against Q.
+
+        The covariance is (d, d).
+        """
         cov = super()._noise_cov(t, dt)
         if dt and is_first_use(self, "transition_matrix"):
             # The check calls the user's functions for half steps, at which they may fail, as a
@@ -359,7 +372,10 @@ class LinearModel(Model):
         return cov
 
     def _is_transposed(self, t: float, dt: float, cov: Array) -> bool:
-        """Whether Φᵀ in place of Φ makes two half steps add the noise of a whole step."""
+        """Whether Φᵀ in place of Φ makes two half steps add the noise of a whole step.
+
+        `cov` is the noise covariance Q of the step from t to t + dt.
+        """
         # The noise of a whole step is that of the first half, propagated by Φ of the second half,
         # plus that of the second half.
         half = dt / 2
@@ -429,7 +445,10 @@ def _takes_time(function: Callable[..., Array]) -> bool:
 def _make_matrix(
     transition_matrix: Callable[..., Array], dim: int, *args: float | None
 ) -> Array:
-    """Call a transition matrix with dt, or with (t, dt), and check its result."""
+    """Call a user's ``transition_matrix(*args)`` and check its result, (dim, dim).
+
+    The arguments are dt, or t and dt.
+    """
     phi = call_user(transition_matrix, *args)
     return check_array(phi, "transition_matrix", (dim, dim))
 

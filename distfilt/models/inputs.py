@@ -177,9 +177,13 @@ class InputModel(Model):
         # At the first use a step checks `transition`; its result is not needed.
         self.step(x, t, dt)
         root = factor(self.inputs.cov)
-        for _, length, u in self.inputs.pieces(t, dt):
+        # The parts of the step in which one input u holds, one after the other. The transition
+        # depends on a part's length alone, not on when it begins.
+        for _begin, length, u in self.inputs.pieces(t, dt):
+            # u + ε with ε = L z and Σ = L Lᵀ; rows are states, so z multiplies Lᵀ.
             normal = rng.standard_normal((*x.shape[:-1], u.size))
             x = _move(self.driven_transition, x, u + normal @ root.T, length)
+        # The further noise w of the whole step
         lower = self.noise_sqrt(t, dt)
         return np.asarray(x + rng.standard_normal(x.shape) @ lower.T)
 
@@ -218,7 +222,7 @@ def move_by_inputs(
     x: Array,
 ) -> Array:
     """Move states (..., d) by one input after the other; inputs broadcast to the states."""
-    for _, length, u in pieces:
+    for _begin, length, u in pieces:
         x = _move(driven_transition, x, u, length)
     return x
 
@@ -229,7 +233,10 @@ def add_up_noise(
     x: Array,
     cov: Array,
 ) -> Array:
-    """Return the noise that inputs with a covariance (..., k, k) add to states (..., d).
+    """Return the covariance (..., d, d) that inputs with one of (..., k, k) add to states (..., d).
+
+    The inputs hold in the pieces of a step, one after the other, and enter the states by
+    ``driven_transition(x, u, dt)``.
 
     >>> def move(x, u, dt):
     ...     return x + dt * u
@@ -239,9 +246,11 @@ def add_up_noise(
     """
     d = x.shape[-1]
     total = np.zeros((*x.shape, d))
-    for _, length, u in pieces:
+    # The parts of a step in which one input u holds, one after the other
+    for _begin, length, u in pieces:
         inputs = np.broadcast_to(u, (*x.shape[:-1], u.shape[-1]))
 
+        # The default binds this part's length: a closure would see that of a later one.
         def move(joint: Array, dt: float = length) -> Array:
             return _move(driven_transition, joint[..., :d], joint[..., d:], dt)
 

@@ -62,6 +62,7 @@ def constant_velocity(
     >>> model.step([1.0, 2.0, 0.5, -0.5], 0.0, 2.0)
     array([ 2. ,  1. ,  0.5, -0.5])
     """
+    # Names of the components, such as x, y, vx, vy
     positions = _AXES[:axes]
     velocities = tuple(f"v{axis}" for axis in positions)
     return LinearModel.from_transition(
@@ -91,9 +92,12 @@ def _straight_noise(t: float, dt: float, sigma: float, axes: int) -> Array:
 
 @lru_cache(maxsize=64)
 def _repeat_along_axes(block: tuple[tuple[float, float], ...], axes: int) -> Array:
-    """Kronecker product of a block with I, read-only and cached: few recur in every step."""
-    # All positions, then all velocities: block ⊗ I. Its four quarters are diagonal, and a
-    # step along a diagonal is one of n + 1 numbers.
+    """Kronecker product of a block with I, read-only and cached: few recur in every step.
+
+    The block is 2 x 2, and I has the size of the number of axes.
+    """
+    # All positions, then all velocities: block ⊗ I. Its four quarters are diagonal. In the
+    # matrix's numbers, row after row, a step along a diagonal is one of n + 1 numbers.
     (upper_left, upper_right), (lower_left, lower_right) = block
     n = 2 * axes
     half = n * axes
@@ -103,6 +107,7 @@ def _repeat_along_axes(block: tuple[tuple[float, float], ...], axes: int) -> Arr
     numbers[half :: n + 1] = lower_left
     numbers[half + axes :: n + 1] = lower_right
     matrix = numbers.reshape(n, n)
+    # All callers share the cached array.
     matrix.setflags(write=False)
     return matrix
 
@@ -148,7 +153,10 @@ def rk4(
 def runge_kutta(
     rate: Rate, x: Array, t: float, dt: float, longest: float | None = None
 ) -> Array:
-    """Integrate like :func:`rk4`, without validation; `dt` may be negative."""
+    """Integrate like :func:`rk4`, without validation; `dt` may be negative.
+
+    States are (..., d), and steps are not longer than `longest`; one step by default.
+    """
     steps = count_steps(abs(dt), longest)
     # Equal steps: the last one ends at t + dt, up to rounding.
     h = dt / steps
@@ -156,8 +164,8 @@ def runge_kutta(
         s = t + k * h
         # x + h/6 (k1 + 2 k2 + 2 k3 + k4) with four slopes: k1 here, k2 and k3 halfway, k4 at the
         # end. It is computed as x + h/3 (k1/2 + k2 + k3 + k4/2).
-        # The rate may work in place: it gets arrays of its own, and its result is used before it
-        # is called again.
+        # The rate may work in place: it gets arrays of its own (a copy in the same order of memory,
+        # "K"), and its result is used before it is called again.
         slope = check_array(rate(x.copy("K"), s), "rate", x.shape, finite=False)
         total = 0.5 * slope
         slope = rate(x + 0.5 * h * slope, s + 0.5 * h)
@@ -194,7 +202,11 @@ def integrate(
     units: tuple[str, ...],
     periods: PeriodsArgument = (),
 ) -> Model:
-    """Build a model from a rate by :func:`rk4`, with white noise of spectral density (d, d)."""
+    """Build a model from a rate by :func:`rk4`, with white noise of spectral density (d, d).
+
+    `step` is the longest step of the integration; names, units and periods are those of the
+    components.
+    """
     return Model(
         len(density),
         partial(_rk4_transition, rate=rate, longest=step),
@@ -251,7 +263,8 @@ def _lorenz_rate(state: Array, t: float) -> Array:
     y = state[..., 1]
     z = state[..., 2]
     rate = np.empty_like(state)
-    # Written into the rate without temporary arrays: this is the inner loop of every study.
+    # 10 (y - x), x (28 - z) - y and x y - 8/3 z, written into the rate without temporary arrays:
+    # this is the inner loop of every study.
     x_rate = np.subtract(y, x, rate[..., 0])
     x_rate *= _PRANDTL
     y_rate = np.subtract(_RAYLEIGH, z, rate[..., 1])

@@ -103,6 +103,7 @@ def acceleration(position: Position) -> Array:
     >>> acceleration([7000.0, 0.0, 0.0]).round(8) + 0.0
     array([-0.00814567,  0.        ,  0.        ])
     """
+    # 1 / r²
     z = position[..., 2]
     inverse_square = 1 / np.einsum("...i,...i->...", position, position)
     # μ/r³ of the central force, and J₂ μ R²/(2 r⁵) of the oblateness
@@ -168,6 +169,7 @@ def propagate(
     Bounds(at_most=1.5e6)(np.abs(x[..., :3]), "x, in km")
     steps = count_steps(abs(dt), longest)
     h = dt / steps
+    # An overflow ends in NaN, which the check after the step refuses.
     with np.errstate(all="ignore"):
         for _ in range(steps):
             # The rate does not depend on the time.
@@ -189,6 +191,7 @@ def _dop853(x: Array, h: float) -> Array:
     a = h * DOP853.A[:12, :12]
     b = h * DOP853.B
     slopes = np.empty((12, *x.shape))
+    # A view of the slopes with one row each, for sums over them.
     flat = slopes.reshape(12, -1)
     slopes[0] = _rate(x)
     for k in range(1, 12):
@@ -242,6 +245,7 @@ def _constant_noise(noise_cov: Array, t: float, dt: float) -> Array:
 
 def _transition(x: Array, t: float, dt: float) -> Array:
     """Move states (..., 6 bodies) by `dt` seconds: each satellite independently of the others."""
+    # One satellite a row
     states = x.reshape(*x.shape[:-1], -1, 6)
     return propagate(states, dt).reshape(x.shape)
 
@@ -256,7 +260,8 @@ def _derivative(x: Array, t: float, dt: float, bodies: int) -> Array:
     step = 1e-2
     states = x.reshape(*x.shape[:-1], bodies, 1, 6)
     shifts = step * np.eye(6)
-    # Axes: bodies, the component that is shifted, and the components where the orbit ends.
+    # Each shifted state moves like a satellite by itself. Axes: bodies, the component that is
+    # shifted, and the components where the orbit ends.
     forward, backward = _transition(np.stack([states + shifts, states - shifts]), t, dt)
     blocks = np.swapaxes((forward - backward) / (2 * step), -1, -2)
     # One block for each body on the diagonal
@@ -321,6 +326,7 @@ def occulted(a: Position, b: Position) -> Array:
     >>> bool(occulted([42164.0, 0, 0], [0, 42164.0, 0]))
     False
     """
+    # The line of sight and its squared length, which is zero if both are in one place.
     line = b - a
     square = np.einsum("...i,...i->...", line, line)
     # a + s (b - a) is nearest to the Earth's centre at s = -a·(b - a)/|b - a|², within [0, 1].

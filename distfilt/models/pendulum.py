@@ -77,7 +77,11 @@ def pendulum_rate(
 
 
 def _rate(states: Array, t: float, length: float, g: float, printed: bool) -> Array:
-    """Return the time derivatives (..., 4) of states (x, y, u, v), with u and v the velocities."""
+    """Return the time derivatives (..., 4) of states (x, y, u, v), with u and v the velocities.
+
+    `length` is the pendulum's length L and `g` the gravity; `printed` says whether the equations
+    are those that the paper prints.
+    """
     x = states[..., 0]
     y = states[..., 1]
     u = states[..., 2]

@@ -62,6 +62,7 @@ def drive_poses(
         raise ValueError(
             f"u must have no more leading axes than x, {x.shape[:-1]}, got {u.shape[:-1]}"
         )
+    # Poses and rates (..., A, 3) of A bodies
     poses = x[..., :n].reshape(*x.shape[:-1], -1, 3)
     rates = np.broadcast_to(u, (*x.shape[:-1], n)).reshape(poses.shape)
     turn = dt * rates[..., 2]
@@ -73,6 +74,7 @@ def drive_poses(
     s = chord * np.sin(middle)
     forward = rates[..., 0]
     left = rates[..., 1]
+    # The speeds, turned from the body's frame, along the chord
     shift = np.stack([c * forward - s * left, s * forward + c * left, turn], axis=-1)
     moved = (poses + shift).reshape(*x.shape[:-1], n)
     return np.concatenate([moved, x[..., n:]], axis=-1)
@@ -90,7 +92,8 @@ def planar_odometry(
     r"""Poses that measured odometry drives, and constants behind them.
 
     With `std` it is an :class:`InputModel`, whose noise depends on the headings; some families
-    refuse that. With `sigma` alone the noise is the same everywhere.
+    refuse that. With `sigma` alone the noise is the same everywhere. The components have no names:
+    records call them ``"0"``, ``"1"`` and so on.
 
     Parameters
     ----------
@@ -100,7 +103,8 @@ def planar_odometry(
         Forward and leftward speed and turn rate of each of A bodies, in m/s, m/s and rad/s.
     std : three float
         Standard deviations of the errors of these rates. An error lasts as long as its input, and
-        acts in the body's frame.
+        acts in the body's frame. Errors of two inputs are independent, so one input cut in two
+        gets half of the variance.
     sigma : (float, float)
         Strengths of a random walk of each place, in m/√s, and of each heading, in rad/√s, beyond
         the errors of the rates.
@@ -131,6 +135,7 @@ def planar_odometry(
     drift = np.zeros(dim)
     drift[:k] = np.tile([place_variance, place_variance, heading_variance], k // 3)
     noise_cov = partial(_random_walk_cov, np.diag(drift))
+    # Every third component is a heading.
     periods = {component: 2 * np.pi for component in range(2, k, 3)}
     inputs = Inputs(times, rates, np.diag(np.tile(np.square(std), k // 3)))
     if any(std):
@@ -142,7 +147,8 @@ def planar_odometry(
 
 def _drive(inputs: Inputs, x: Array, t: float, dt: float) -> Array:
     """Move states (..., d) by the inputs of a step, which are taken as exact."""
-    for _, length, u in inputs.pieces(t, dt):
+    # The parts of the step in which one input holds, one after the other
+    for _begin, length, u in inputs.pieces(t, dt):
         x = drive_poses(x, u, length)
     return x
 

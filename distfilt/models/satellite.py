@@ -24,7 +24,10 @@ __all__ = ["clohessy_wiltshire", "satellite_pose"]
 
 
 def _drift(rate: float) -> Array:
-    """The matrix A, (6, 6), of the Clohessy-Wiltshire equations dx/dt = A x."""
+    """The matrix A, (6, 6), of the Clohessy-Wiltshire equations dx/dt = A x.
+
+    `rate` is the orbital rate n of the chief, in rad/s.
+    """
     a = np.zeros((6, 6))
     # Positions change by the velocities.
     a[:3, 3:] = np.eye(3)
@@ -40,7 +43,8 @@ def _drift(rate: float) -> Array:
 def _transition_matrix(dt: float, rate: float) -> Array:
     """The exact matrix exp(A dt), (6, 6), of the Clohessy-Wiltshire equations.
 
-    W. H. Clohessy and R. S. Wiltshire, Journal of the Aerospace Sciences 27 (1960) 653-658.
+    W. H. Clohessy and R. S. Wiltshire, Journal of the Aerospace Sciences 27 (1960) 653-658. `rate`
+    is the orbital rate n of the chief, in rad/s.
     """
     n = rate
     # The angle, in rad, that the chief moves on its orbit
@@ -58,6 +62,7 @@ def _transition_matrix(dt: float, rate: float) -> Array:
             [0, 0, -n * s, 0, 0, c],
         ]
     )
+    # Read-only, since all callers share the cached array.
     phi.setflags(write=False)
     return phi
 
@@ -69,6 +74,7 @@ def _noise_integral(rate: float, sigma: float, dt: float) -> Array:
     `rate` is that of the orbit, in rad/s, and `sigma` the noise's σ of `clohessy_wiltshire`.
     C. F. Van Loan, IEEE Transactions on Automatic Control 23 (1978) 395-404.
     """
+    # The matrix A of the equations of motion
     a = _drift(rate)
     # White noise on all six rows of the equations
     density = sigma**2 * np.eye(6)
@@ -76,6 +82,7 @@ def _noise_integral(rate: float, sigma: float, dt: float) -> Array:
     blocks = expm(dt * np.block([[-a, density], [np.zeros((6, 6)), a.T]]))
     phi = blocks[6:, 6:].T
     cov = symmetrise(phi @ blocks[:6, 6:])
+    # Read-only, since all callers share the cached array.
     cov.setflags(write=False)
     return cov
 
@@ -157,6 +164,7 @@ def _pose_transition(x: Array, t: float, dt: float, rate: float, step: float) ->
     """Move states (..., 13): the translation exactly, the attitude by Runge-Kutta steps."""
     translation = x[..., :6] @ _transition_matrix(dt, rate).T
     # Components first: each operation then runs over contiguous memory.
+    # Angular velocities and quaternions, (7, n).
     rows = np.ascontiguousarray(x.reshape(-1, 13)[:, 6:].T)
     rows = runge_kutta(partial(_attitude_rate, alpha=rate), rows, t, dt, step)
     # Back to states in rows

@@ -31,7 +31,7 @@ Positions = Annotated[ArrayInput, "... self.dim"]
 
 
 def _reflect(x: Array, low: Array, high: Array) -> Array:
-    """Fold positions back into a box with reflecting walls."""
+    """Fold positions (..., d) back into a box with reflecting walls, from `low` to `high`, (d,)."""
     width = high - low
     # A path on between mirrors: a triangular wave of period 2 width, which is 0 at the lower wall
     # and `width` at the upper one.
@@ -41,7 +41,10 @@ def _reflect(x: Array, low: Array, high: Array) -> Array:
 
 
 def check_inside(positions: Array, low: Array, high: Array) -> None:
-    """Refuse positions (..., d) outside the box."""
+    """Refuse positions (..., d) outside the box.
+
+    The lower corner is `low`, the upper one `high`, (d,) each.
+    """
     # Walls belong to the box; NaN passes this comparison, and was refused before.
     outside = ((positions < low) | (positions > high)).any(axis=-1)
     if outside.any():
@@ -52,7 +55,10 @@ def check_inside(positions: Array, low: Array, high: Array) -> None:
 
 
 def _expand_diffusion(value: object, points: tuple[int, ...], dim: int) -> Array:
-    """Validate a diffusion, isotropic or per axis, and broadcast it to (*points, d)."""
+    """Validate a diffusion, isotropic or per axis, and broadcast it to (*points, d).
+
+    The points are all axes of the positions but the last, which has d = `dim` coordinates.
+    """
     diffusion = check_array(value, "diffusion")
     # Isotropic: one number, or one at each point.
     if diffusion.shape in ((), points):
@@ -117,7 +123,8 @@ class Swarm(FrozenModel):
             high = self.high.tolist()
             raise ValueError(f"high must be above low = {low}, got {high}")
         if not callable(self.diffusion):
-            # A copy of the caller's array; functions are checked when they are called.
+            # A copy of the caller's array; functions are checked when they are called. The
+            # dataclass is frozen, so that the field cannot be assigned to.
             diffusion = _expand_diffusion(self.diffusion, (), self.dim).copy()
             object.__setattr__(self, "diffusion", diffusion)
 

@@ -137,6 +137,7 @@ def order_nodes(
     ValueError: graph must have the nodes ['a', 'b', 'c'], got [3, 1, 2]
     """
     labels = set(nodes)
+    # Labels 0, 1, ... are the agents' numbers.
     if labels == set(range(len(nodes))):
         return range(len(nodes))
     if names:

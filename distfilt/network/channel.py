@@ -516,6 +516,8 @@ class Channel:
 
     def _delay_values(self, values: Array) -> Array:
         """Return the values of some rounds ago; zeros, without a weight, before the first."""
+        # Values of each shape wait in a queue of their own, as copies: the array may be changed
+        # before they are used.
         queue = self._queues.setdefault(values.shape, _Queues()).values
         queue.append(values.copy())
         if len(queue) > self.faults.total_delay:
@@ -792,7 +794,8 @@ def _count_payloads(
         for part in copies:
             # The number of entries that a run sends
             count = part.size // n_runs
-            # A sum of squares is NaN only if an entry is, and takes half as long as np.isnan.
+            # Of floats, "f": a sum of squares is NaN only if an entry is, and takes half as long as
+            # np.isnan.
             if part.dtype.kind == "f" and math.isnan(np.vdot(part, part)):
                 count = _count_present(part, n_runs)
             scalars[agent] += count
@@ -809,7 +812,8 @@ def _copy_part(part: object, agent: int, runs: tuple[int, ...]) -> Part:
 
     The part is one of an agent's payload, with the leading axes of the runs.
     """
-    # A masked array's mask, or an object, could carry numbers that are not counted.
+    # A masked array's mask, or an object, could carry numbers that are not counted. numpy's letters
+    # "biuf" are booleans, integers with and without a sign, and floats.
     plain = part if isinstance(part, np.ndarray) else None
     if isinstance(part, np.ma.MaskedArray):
         plain = None

@@ -395,6 +395,7 @@ def intersect_ensembles(
     """
     if rounds > 1:
         _warn_if_disconnected(channel)
+    # Two members or more, before the sample covariances are made of them
     _check_members(ensembles.shape[-2], 1)
     unit = 1.0 if scale is None else scale
     x = ensembles / unit

@@ -126,9 +126,10 @@ def diffuse_means(
     if rounds > 1:
         _warn_if_disconnected(channel)
     means, covs = belief
-    # Constants that differ would lose what every agent is certain of.
+    # Refuses constants that differ: mixed, they would lose what every agent is certain of.
     find_known(means, covs, channel.periods, "belief")
-    # Means on a line are mixed by the weights.
+    # Means on a line are mixed by the weights. Covariances are copied, since the result is the
+    # caller's to change.
     if not channel.periods:
         means = channel.mix(means, weights, on_loss=on_loss, rounds=rounds)
         return means, covs.copy()

@@ -58,7 +58,8 @@ def pi_start(estimate: Annotated[ArrayInput, "... A k"]) -> PIState:
     >>> pi_start([[1.0], [3.0]]).estimate.shape
     (2, 1)
     """
-    # η starts at zero: the sum of the integrals, which never changes, must vanish.
+    # η starts at zero: the sum of the integrals, which never changes, must vanish. A copy, since
+    # the argument may be the user's array.
     return PIState.construct(estimate.copy(), np.zeros_like(estimate))
 
 

@@ -75,6 +75,8 @@ def wrap(
 def wrap_angles(angles: Array, period: float) -> Array:
     """Bring angles into [-period/2, period/2), unchecked: see :func:`wrap`.
 
+    Angles are (...), and so is the result; the period is one for all.
+
     >>> wrap_angles(np.array([-np.pi, np.pi]), 2 * np.pi).round(6)
     array([-3.141593, -3.141593])
     """
@@ -152,6 +154,8 @@ class Sensor(FrozenModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # One entry for each component, or none at all. The dataclass is frozen, so that the field
+        # cannot be assigned to.
         periods = read_periods(self.periods, self.dim)
         object.__setattr__(self, "periods", periods)
         self._check_signatures()
@@ -173,6 +177,7 @@ class Sensor(FrozenModel):
 
     def _check_signatures(self) -> None:
         """Refuse functions that cannot be called as the class calls them."""
+        # The names of the arguments by position
         states = "x, previous" if self.uses_previous else "x"
         check_signature(self.h, "h", states)
         if self.derivative is not None:
@@ -344,6 +349,7 @@ class Sensor(FrozenModel):
         >>> offset.jacobian([0.0], std=[1e6]).round(9)
         array([[1.]])
         """
+        # The arguments of h: the present states, and the previous ones if it takes them
         states = self._arguments(x, previous)
         d = x.shape[-1]
         shape = (*states[0].shape[:-1], self.dim, d)
@@ -363,6 +369,8 @@ class Sensor(FrozenModel):
         differences = partial(
             difference_with_error, vary, states[0], self.residual, scale=std
         )
+        # A given derivative comes here the first time only, to be compared with differences, whose
+        # errors do no harm if they are small beside the noise.
         return evaluate_derivative(
             self,
             states,
@@ -376,6 +384,8 @@ class Sensor(FrozenModel):
 
 def count_turns(sensor: Sensor, observed: Array) -> float:
     """Return by how many of its turns a sensor's values (N, m) are off, at most.
+
+    Values are observations; turns are 2π, or the period if that is longer.
 
     >>> compass = Sensor(1, lambda x: x, [[1.0]], periods=(2 * np.pi,))
     >>> round(count_turns(compass, np.array([[90.0]])))

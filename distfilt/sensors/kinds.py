@@ -131,6 +131,7 @@ def ephemeris(*, position_std: Deviation, velocity_std: Deviation) -> Sensor:
 def _diagonal_cov(stds: Sequence[float]) -> Array:
     """Return the covariance of independent components, read-only."""
     cov: Array = np.diag(np.square(np.asarray(stds)))
+    # Read-only, as all arrays of a sensor are.
     cov.setflags(write=False)
     return cov
 
@@ -200,6 +201,7 @@ def distance(
         raise ValueError(
             f"origin must have shape ({len(indices)},), got {origin.shape}"
         )
+    # The arguments `indices`, `origin` and `observer` of the prediction and of its derivative
     geometry = _geometry(indices, origin, observer)
     return Sensor.construct(
         dim=1,
@@ -295,7 +297,12 @@ def _angle_sensor(
     observer: Sequence[int] | None,
     period: float,
 ) -> Sensor:
-    """Return the sensor of a direction or of the angle of a line, by its period."""
+    """Return the sensor of a direction or of the angle of a line, by its period.
+
+    Its kind is a name, its `std` in rad. The sensor stands at `origin`, or where the components
+    `observer` of the state say.
+    """
+    # The arguments `indices`, `origin` and `observer` of the prediction and of its derivative
     geometry = _geometry(indices, origin, observer, has_heading=True)
     return Sensor.construct(
         dim=1,
@@ -356,6 +363,7 @@ def range_bearing(
         raise ValueError(
             f"heading must be 0 for a sensor on a body of the state, got {heading:g}"
         )
+    # The arguments `indices`, `origin` and `observer` of the prediction and of its derivative
     geometry = _geometry(indices, origin, observer, has_heading=True)
     return Sensor.construct(
         dim=2,
@@ -385,8 +393,8 @@ def _geometry(
 ) -> _Geometry:
     """Return the components that form a place, and the place of the sensor as an own copy.
 
-    An observer has as many components as a place, and a heading behind them if
-    `has_heading` allows it.
+    An observer has as many components as a place, and a heading behind them if `has_heading` allows
+    it. An origin is (n,) for n indices, and zero by default.
     """
     # A copy: the caller's array may be that of a robot that moves on.
     place = np.array(0.0 if origin is None else origin)
@@ -394,6 +402,7 @@ def _geometry(
         return {"indices": tuple(indices), "origin": place, "observer": ()}
     if origin is not None:
         raise ValueError("origin must be None for a sensor on a body of the state")
+    # As many components as the place has, and perhaps one more: has_heading counts as 0 or 1.
     n = len(indices)
     if len(observer) not in (n, n + has_heading):
         expected = f"{n} or {n + 1}" if has_heading else str(n)
@@ -414,7 +423,10 @@ def _geometry(
 def _offset(
     x: Array, indices: tuple[int, ...], origin: Array, observer: tuple[int, ...]
 ) -> Array:
-    """Return the vector from the sensor to the place that some components form."""
+    """Return the vector (..., n) from the sensor to the place that n components form.
+
+    The sensor is at `origin`, or, on a body of the state, where its components `observer` say.
+    """
     place = origin
     if observer:
         place = x[..., _columns(observer[: len(indices)], x.shape[-1])]
@@ -477,13 +489,17 @@ def _distance_jacobian(
     x: Array, indices: tuple[int, ...], origin: Array, observer: tuple[int, ...]
 ) -> Array:
     """Return the derivatives (..., 1, d) of distances."""
+    # The vector from the sensor to the place, and the derivative (..., n) of its length
     offset = _offset(x, indices, origin, observer)
     slope = _distance_slope(offset, _lengths(offset))
     return _insert_columns(slope[..., None, :], indices, observer, x.shape[-1])
 
 
 def _distance_slope(offset: Array, length: Array) -> Array:
-    """Return the derivative of vectors' lengths, and zero at the vector zero."""
+    """Return the derivative of vectors' lengths, and zero at the vector zero.
+
+    Vectors are (..., n), and their lengths (..., 1).
+    """
     # ∂|v|/∂v = vᵀ / |v|
     return np.asarray(offset / _replace_zeros(length, value=1.0))
 
@@ -510,7 +526,10 @@ def _angle(
 
 
 def _direction(offset: Array, period: float, heading: float | Array) -> Array:
-    """Return the angles of vectors (..., 2) from a heading, NaN for the vector zero."""
+    """Return the angles (..., 1) of vectors (..., 2) from a heading, NaN for the vector zero.
+
+    They are wrapped to one `period` around zero.
+    """
     angle = np.arctan2(offset[..., 1], offset[..., 0])
     # arctan2(0, 0) is 0, but the sensor's own place has no direction.
     if np.count_nonzero(offset) < offset.size:
@@ -521,7 +540,13 @@ def _direction(offset: Array, period: float, heading: float | Array) -> Array:
 def _angle_jacobian(
     x: Array, indices: tuple[int, ...], origin: Array, observer: tuple[int, ...]
 ) -> Array:
-    """Return the derivatives (..., 1, d) of directions, NaN at the sensor's own place."""
+    """Return the derivatives (..., 1, d) of directions, NaN at the sensor's own place.
+
+    The bearing is that of the components `indices` from `origin`, or from the components
+    `observer`, behind which a heading may stand.
+    """
+    # The vector from the sensor to the place, and the derivative (..., 2) of its angle; by the
+    # components of the state it has zeros elsewhere.
     offset = _offset(x, indices, origin, observer)
     slope = _angle_slope(offset, _lengths(offset))
     jacobian = _insert_columns(slope[..., None, :], indices, observer, x.shape[-1])
@@ -532,7 +557,10 @@ def _angle_jacobian(
 
 
 def _angle_slope(offset: Array, length: Array) -> Array:
-    """Return the derivative of vectors' angles, and NaN at the vector zero."""
+    """Return the derivative of vectors' angles, and NaN at the vector zero.
+
+    Vectors are (..., 2), and their lengths (..., 1).
+    """
     # ∂ arctan2(b, a) / ∂(a, b) = (-b, a) / (a² + b²), by unit vectors to avoid overflow.
     length = _replace_zeros(length, np.nan)
     unit = offset / length
@@ -550,7 +578,13 @@ def _range_bearing(
     origin: Array,
     observer: tuple[int, ...],
 ) -> Array:
-    """Return distances and bearings (..., 2) of states (..., d) from the sensor."""
+    """Return distances and bearings (..., 2) of states (..., d) from the sensor.
+
+    The place is that of the components `indices`, seen from `origin` with a heading, or from the
+    components `observer`, behind which a heading may stand.
+    """
+    # The vector from the sensor to the place, and the sensor's heading, from which bearings are
+    # measured and wrapped to one turn, 2π.
     offset = _offset(x, indices, origin, observer)
     total_heading = heading + _own_heading(x, indices, observer)
     result = np.empty((*offset.shape[:-1], 2))
@@ -562,8 +596,13 @@ def _range_bearing(
 def _range_bearing_jacobian(
     x: Array, indices: tuple[int, ...], origin: Array, observer: tuple[int, ...]
 ) -> Array:
-    """Return the derivatives (..., 2, d) of distances and bearings."""
-    # A constant heading only shifts the bearing, so that it does not enter.
+    """Return the derivatives (..., 2, d) of distances and bearings.
+
+    The place is that of the components `indices`, seen from `origin`, or from the components
+    `observer`, behind which a heading may stand.
+    """
+    # The vector from the sensor to the place. A constant heading only shifts the bearing, so that
+    # it does not enter.
     offset = _offset(x, indices, origin, observer)
     length = _lengths(offset)
     # At the sensor's own place there is no bearing: its derivative is NaN.
@@ -770,7 +809,10 @@ def _stack_matrices(dim: int, sensors: Sequence[Sensor]) -> Array:
 def _stack_residuals(
     observed: Array, predicted: Array, sensors: Sequence[Sensor]
 ) -> Array:
-    """Return the residuals (..., M) of stacked sensors, each by the rule of its sensor."""
+    """Return the residuals (..., M) of stacked sensors, each by the rule of its sensor.
+
+    Observations and predictions are (..., M), those of the sensors side by side.
+    """
     # Each sensor takes its own part of the components.
     ends = np.cumsum([sensor.dim for sensor in sensors])[:-1]
     observed_parts = np.split(observed, ends, axis=-1)

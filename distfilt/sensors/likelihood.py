@@ -154,6 +154,8 @@ class LikelihoodSensor(Sensor):
             linear=None,
             derivative=None,
         )
+        # The dataclass's own constructor is replaced, so that the other fields get their defaults
+        # here.
         for item in fields(self):
             if item.name not in vars(self):
                 vars(self)[item.name] = item.default
@@ -177,6 +179,7 @@ class LikelihoodSensor(Sensor):
                 f"moments must be a function for a gate, for nis or for a prediction by a sensor "
                 f"of kind {self.kind!r}, got None"
             )
+        # A copy, since a user's function might write into its argument.
         mean, cov = call_user(self.moments, x.copy())
         shape = (*x.shape[:-1], self.dim)
         mean = check_array(mean, "moments", shape)
@@ -195,6 +198,7 @@ class LikelihoodSensor(Sensor):
             raise ValueError(
                 f"sample must be a function to draw from a sensor of kind {self.kind!r}, got None"
             )
+        # A copy, since a user's function might write into its argument.
         drawn = call_user(self.sample, x.copy(), rng=rng)
         drawn = check_array(drawn, "sample", (*x.shape[:-1], self.dim))
         return np.asarray(drawn, dtype=np.float64)
@@ -221,6 +225,7 @@ class LikelihoodSensor(Sensor):
             observed = np.where(
                 is_missing[..., None], observed[~is_missing][0], observed
             )
+        # Copies, since a user's function might write into its arguments.
         result = call_user(self.log_likelihood, x.copy(), observed.copy())
         refuse_mask(result, "log_likelihood")
         logs = np.asarray(result, dtype=np.float64)
@@ -236,6 +241,7 @@ class LikelihoodSensor(Sensor):
         if logs.size < _MANY or logs.min() < 0 or not needs_check(self, "logarithm"):
             return
         least, largest = logs.min(), logs.max()
+        # Likelihoods of many states differ by more than this factor.
         if least < 1e-3 * largest:
             mark_checked(self, "logarithm")
             warnings.warn(
@@ -246,7 +252,10 @@ class LikelihoodSensor(Sensor):
             )
 
     def _check_logs(self, logs: Array, x: Array, observed: Array) -> None:
-        """Refuse log-likelihoods of a wrong shape, or that are no numbers."""
+        """Refuse log-likelihoods of a wrong shape, or that are no numbers.
+
+        They are (...), of states x (..., d) and observations (..., m).
+        """
         lead = x.shape[:-1]
         if logs.shape != lead:
             raise ValueError(

@@ -47,6 +47,7 @@ def locate_sighting(
     array([1., 2.])
     """
     distance, bearing = value
+    # The angle of the ray in the frame of the map
     pose = _read_pose(x, observer)
     angle = pose.heading + bearing
     place = [

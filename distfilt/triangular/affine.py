@@ -118,7 +118,10 @@ def compose(
 
 
 def _check_sizes(map_: ConditionalMap, y: Array, x: Array) -> None:
-    """Raise an error if samples do not have the sizes of a map; a user's own may not know any."""
+    """Raise an error if samples do not have the sizes of a map; a user's own may not know any.
+
+    Samples y are (..., N, m) and x (..., N, d).
+    """
     for name, samples, size_name in (("y", y, "n_observed"), ("x", x, "dim")):
         size = getattr(map_, size_name, None)
         n_columns = samples.shape[-1]
@@ -207,7 +210,7 @@ class AffineMap(FrozenModel):
     def log_det(self, y: MapObservations, x: MapStates) -> Array:
         """Return the log-determinant of the map's derivative in x at each member, (..., N)."""
         diagonal = np.diagonal(self.scale, axis1=-2, axis2=-1)
-        # det L⁻¹, the same for all members.
+        # det L⁻¹, the same for all members: repeated, as an array to which can be written.
         value = -np.log(diagonal).sum(axis=-1)
         return np.broadcast_to(value[..., None], x.shape[:-1]).copy()
 
@@ -251,6 +254,7 @@ def check_variables(wrong: Mask, m: int, needs: str) -> None:
     columns = np.flatnonzero(flat_wrong.any(axis=0))
     if not columns.size:
         return
+    # The first m columns are y, the others x.
     column = int(columns[0])
     name = "y"
     if column >= m:
@@ -290,9 +294,11 @@ def fit(y: ObservationSamples, x: StateSamples) -> AffineMap:
 def from_moments(mean: Array, covariance: Array, m: int) -> AffineMap:
     """Return the affine map of a Gaussian (y, x), or of samples with these moments (divided by N).
 
-    Raises an error that names y or x if its covariance has no Cholesky factor.
+    Raises an error that names y or x if its covariance has no Cholesky factor. The covariance is
+    (..., m + d, m + d), the mean (..., m + d), and the first m variables are y.
     """
     needs = "are not constant and not combinations of others"
+    # The Cholesky factor of the covariance of (y, x)
     lower = _factor_joint(covariance, m, needs)
     # Rounding may give a repeated variable a tiny variance: L_kk² is the variance of variable k
     # that the variables before it do not explain.
@@ -300,6 +306,7 @@ def from_moments(mean: Array, covariance: Array, m: int) -> AffineMap:
     unexplained = np.diagonal(lower, axis1=-2, axis2=-1) ** 2
     is_combination = unexplained <= _ROUNDING * variance
     is_constant = variance <= (_ROUNDING * mean) ** 2
+    # The error names the first such variable, as a column of y or of x.
     check_variables(is_combination | is_constant, m, needs)
     # The factor of the joint covariance contains the map: its lower blocks are K L_yy and L.
     observed_factor = lower[..., :m, :m]
@@ -438,7 +445,10 @@ _PROGRAM_LOCK = Lock()
 
 
 def _solve_component(design: Array, solver: str) -> Array:
-    """Return the coefficients (n,) of one component for features (N, n), by a conic solver."""
+    """Return the coefficients (n,) of one component for features (N, n), by a conic solver.
+
+    The features, one row a sample, are the `design`.
+    """
     cp = import_optional("cvxpy", "maps")
     n = design.shape[-1]
     program = _compile_program(n)

@@ -82,8 +82,10 @@ def pool_by_moments(
     >>> bool(abs(pooled.scale - one.scale).max() < 1e-12)
     True
     """
+    # Of all A agents with N members each; the variables (y, x) of these are (..., A, N, m + d).
     n_members = x.shape[-3] * x.shape[-2]
     joint = join_enough_samples(y, x, n_members)
+    # Each agent's copy of the mean over all agents, and its own second moments about that
     centre = _average_values(mean(joint), channel, average)
     anomalies = joint - centre[..., None, :]
     second = anomalies.mT @ anomalies / joint.shape[-2]
@@ -146,12 +148,15 @@ def pool_by_admm(
         raise ValueError(
             f"channel must have a single run for ADMM, got runs {channel.runs}"
         )
+    # Of all A agents with N members each; the variables (y, x) of these are (A, N, m + d).
     n_members = x.shape[-3] * x.shape[-2]
     joint = join_enough_samples(y, x, n_members)
     m = y.shape[-1]
     d = x.shape[-1]
+    # Each agent's copy of the variables' means and deviations over all agents, (A, m + d)
     centre, std = _average_scales(joint, m, channel, average)
     standard = (joint - centre[:, None, :]) / std[:, None, :]
+    # Rows (1, y, x), and each agent's second moments C of them, (A, 1 + m + d, 1 + m + d)
     constant = np.ones((*standard.shape[:-1], 1))
     design = np.concatenate([constant, standard], axis=-1)
     moments = design.mT @ design / design.shape[-2]
@@ -169,6 +174,7 @@ def pool_by_admm(
         tolerance=tolerance,
         average=average,
     )
+    # Unpacked to a row for each component, (A, d, 1 + m + d).
     coefficients = np.zeros((len(joint), *used.shape))
     coefficients[:, used] = run.common
     # Back from standardised variables.
@@ -183,7 +189,8 @@ def _average_scales(
     """Return the mean and standard deviation of each variable over all agents, (A, m + d) each.
 
     They are found by consensus from the agents' own samples (A, N, m + d) of m observed and d state
-    variables: each agent has a copy. A constant variable raises an error.
+    variables: each agent has a copy. A constant variable raises an error. The rule of consensus is
+    `average`.
     """
     centre = _average_values(mean(joint), channel, average)
     anomalies = joint - centre[:, None, :]

@@ -185,6 +185,7 @@ def _earlier_features(v: Array, bumps: Array) -> Array:
 
     `bumps` has the centres and widths of p bumps for each variable, (2, ..., L, p).
     """
+    # The axis None is that of the samples.
     centres, widths = bumps[..., None, :, :]
     u = (v[..., None] - centres) / widths
     heights = np.exp(-0.5 * u**2)
@@ -203,6 +204,7 @@ def _increasing_features(v: Array, steps: Array) -> tuple[Array, Array]:
     """
     from scipy.special import ndtr
 
+    # The axis None is that of the samples.
     centres, widths = steps[..., None, :]
     u = (v[..., None] - centres) / widths
     # The integral of exp(-u² / 2) is a normal distribution function times the bump's area.
@@ -293,9 +295,11 @@ def fit(
             f"x must have more than {n_coefficients} members for as many coefficients, "
             f"got {x.shape[-2]}"
         )
+    # Samples (y, x) of mean zero and variance one, (..., N, m + d)
     samples = _standardise_samples(y, x)
     joint = samples.joint
     _check_combinations(joint, allowed, m)
+    # Centres and widths of the bumps of each variable, at sample quantiles
     bumps = _place_bumps(joint, n_bumps, n_observed=m)
     # Integrated bumps are smooth steps; only the state's variables have them.
     steps = _place_bumps(joint[..., m:], n_steps, n_observed=0)
@@ -306,6 +310,7 @@ def fit(
         features = _earlier_features(joint[..., used], bumps[..., used, :])
         own_variable = joint[..., m + k]
         values, rates = _increasing_features(own_variable, steps[..., k, :])
+        # The constant and the linear coefficients have no penalty.
         n_linear = 1 + len(used)
         weight, slope = _fit_component(
             features, values, rates, n_linear, regularisation
@@ -396,6 +401,7 @@ def _place_bumps(joint: Array, n: int, *, n_observed: int) -> Array:
     edges = quantiles[..., ::2]
     widths = np.diff(edges, axis=-1)
     is_degenerate = np.any(widths <= 0, axis=-1)
+    # The error names the first such variable, as a column of y or of x.
     needs = "have quantiles that differ for the basis functions"
     check_variables(is_degenerate, n_observed, needs)
     return np.stack([centres, widths])
@@ -438,6 +444,7 @@ def _fit_component(
     weighted = feature_penalty[:, None] * regression
     quadratic = quadratic + regression.mT @ weighted
     quadratic = quadratic + np.diag(value_penalty)
+    # Minimise aᵀ Q a / 2 - mean(log(Φ' a)) over a at least these bounds.
     lower = np.where(is_step, 0.0, _LEAST_SLOPE)
     slopes = _minimise_nonnegative(quadratic, rates, lower)
     # c = -W a.
@@ -480,6 +487,7 @@ def _minimise_nonnegative(quadratic: Array, rates: Array, lower: Array) -> Array
         free_gradient = np.where(free, gradient, 0.0)
         solution = np.linalg.solve(system, free_gradient[..., None])
         step = -solution[..., 0]
+        # A part of the step, so that the loss decreases, and back to the bounds
         a = _search_projected(a, step, gradient, quadratic, rates, lower)
         # The Newton decrement gᵀ H⁻¹ g is about twice the distance of the loss from its minimum,
         # before the step. The loss is of the order of one, with a rounding of some 1e-15.

@@ -95,6 +95,7 @@ def update(function: F) -> F:
         raise InvalidArgumentError(
             f"function must be a function, got {type(function).__name__}"
         )
+    # The names by which the function calls its ensemble, predictions, observation and noise
     data = list(signature(function).parameters)[:4]
     annotations = dict(function.__annotations__)
     annotations.update(zip(data, _KINDS, strict=True))
@@ -121,7 +122,9 @@ def update(function: F) -> F:
 def _share_leading_axes(arrays: dict[str, Array]) -> dict[str, Array]:
     """Return predictions and observation with the ensemble's leading axes, where they differ.
 
-    Given are an update's first four arguments by their names; returned are those that change.
+    Given are an update's first four arguments by their names; returned are those that change. They
+    are the ensemble (..., N, d), predictions (..., N, m), the observation (..., m) and the noise's
+    covariance (..., m, m).
     """
     ensemble, predicted, observed, noise = arrays.values()
     lead = ensemble.shape[:-2]
@@ -169,6 +172,7 @@ def wraps_update(wrapped: Update) -> Callable[[F], F]:
 
     def decorate(wrapper: F) -> F:
         checked = update(wrapper)
+        # The attributes by which a filter knows how to call it: see `has_tag`.
         for tag in ("stacks", "accepts_missing", "weights_members"):
             vars(checked)[tag] = has_tag(wrapped, tag)
         return checked
@@ -237,6 +241,7 @@ def with_missing(
     >>> float(after.mean().round(12))
     0.5
     """
+    # The axes of a batch of ensembles, such as runs and agents, and the number of components
     lead = observed.shape[:-1]
     m = observed.shape[-1]
     # The caller's generator advances by the same amount for any pattern.
@@ -244,16 +249,19 @@ def with_missing(
     # The usual case: nothing is missing. A finite sum of squares proves it; it may overflow.
     squares = np.vdot(observed, observed) + np.vdot(predicted, predicted)
     if math.isfinite(squares):
+        # A generator made of the seed, by which each row of a batch has draws of its own.
         stream = _stream(rng, seed, m, lead)
         result = call_user(update, ensemble, predicted, observed, noise, rng=stream)
         return result
-    # A component needs a value, and a prediction of every member.
+    # A component needs a value, and a prediction of every member, to be present: (..., m).
     present = ~np.isnan(observed) & ~np.isnan(predicted).any(axis=-2)
+    # An update with this tag takes NaN for missing components itself.
     if has_tag(update, "accepts_missing"):
         marked = np.where(present, observed, np.nan)
         stream = _stream(rng, seed, m, lead)
         result = call_user(update, ensemble, predicted, marked, noise, rng=stream)
         return result
+    # One call for all ensembles that miss the same components
     return _update_by_pattern(
         update, (ensemble, predicted, observed, noise), present, rng, seed
     )
@@ -268,7 +276,8 @@ def _update_by_pattern(
 ) -> Array:
     """Update the ensembles of a batch, those with the same components `present` together.
 
-    `data` are an update's first four arguments, `present` (..., m), and `seed` that of the draws.
+    `data` are an update's first four arguments; `present` (..., m) marks the components that each
+    ensemble has observed and predicted; `seed` is that of the draws.
     """
     ensemble, predicted, observed, noise = data
     lead = observed.shape[:-1]
@@ -278,6 +287,7 @@ def _update_by_pattern(
     flat_observed = observed.reshape(-1, m)
     flat_ensemble = ensemble.reshape(-1, *ensemble.shape[-2:])
     flat_predicted = predicted.reshape(-1, *predicted.shape[-2:])
+    # One covariance for all rows, or one for each.
     one_noise = noise.ndim == 2
     if not one_noise:
         noise = np.broadcast_to(noise, (*lead, m, m)).reshape(-1, m, m)
@@ -294,6 +304,7 @@ def _update_by_pattern(
             part = noise[np.ix_(columns, columns)]
         else:
             part = noise[np.ix_(rows, columns, columns)]
+        # `_stream` gives each row draws of its own, whatever the other rows miss.
         result[rows] = call_user(
             update,
             flat_ensemble[rows],
@@ -395,11 +406,16 @@ class RowGenerator(Rng):
         axis: int | None = None,
         out: NDArray[np.generic] | None = None,
     ) -> NDArray[np.generic]:
-        """Permute as numpy does, the slices of each row by draws of the row's own."""
+        """Permute as numpy does, the slices of each row by draws of the row's own.
+
+        Arguments are those of numpy's `permuted`.
+        """
         values = np.asarray(x)
+        # An array without an axis of the rows is permuted by numpy.
         if not self._has_rows(values.shape) or axis is None:
             return super().permuted(x, axis=axis, out=out)
-        # The whole batch is permuted, so that every row uses up its own draws.
+        # The whole batch is permuted, so that every row uses up its own draws; the rows that are
+        # not here get any valid values.
         whole = self._fill_batch(values).reshape(-1, *values.shape[1:])
         mixed = self.batch.permuted(whole, axis=axis)[self.rows]
         if out is None:
@@ -421,7 +437,8 @@ class RowGenerator(Rng):
     def _extend_parameter(self, parameter: ArrayLike, n_axes: int) -> ArrayLike:
         """Return a distribution's parameter for the rows as one for the whole batch.
 
-        The draws have `n_axes` axes, the first of which are the rows.
+        The draws have `n_axes` axes, the first of which are the rows. For n rows it is (n, ...),
+        (1, ...) or of fewer axes; for the batch it has the axes *lead in place of the first.
         """
         values = np.asarray(parameter)
         # A parameter without an axis of rows is the same for all rows.

@@ -43,6 +43,7 @@ def _solve_gain(
 
     The anomalies are those of the members, (..., N, d), and of their predictions, (..., N, m); the
     noise covariance R is (..., m, m). Members are rows, so that they move by ``innovations @ K'``.
+    The gain itself is K = C_xh (C_hh + R)⁻¹.
     """
     # Both covariances times N - 1, which cancels.
     scaled_noise = (anomalies.shape[-2] - 1) * noise
@@ -97,7 +98,8 @@ def enkf_sampled_covariance(
             f"ensemble must have at least {m + 1} members for {m} observations, got {n}"
         )
     perturbed = perturb_observations(predicted, noise, rng)
-    # Without R: it is in the sample covariance of the perturbed predictions.
+    # The gain transposed, (..., m, d), since members are rows; without R, which is in the sample
+    # covariance of the perturbed predictions.
     anomalies = center_ensemble(ensemble).anomalies
     gain = _solve_gain(anomalies, center_ensemble(perturbed).anomalies)
     # x_i + K (y* - y_i), as rows.
@@ -139,6 +141,7 @@ def enkf(
     """
     perturbed = perturb_observations(predicted, noise, rng, centred=centred)
     anomalies = center_ensemble(ensemble).anomalies
+    # The gain transposed, (..., m, d), since members are rows
     gain = _solve_gain(anomalies, center_ensemble(predicted).anomalies, noise)
     # x_i + K (y* - y_i) with the perturbed predictions y_i; the results overwrite arrays that were
     # made here, which saves time.
@@ -178,6 +181,7 @@ def enkf_exact(
     # Orthogonal to both, so that no sample covariance with the draws enters P⁺.
     joint_anomalies = np.concatenate([anomalies, predicted_anomalies], axis=-1)
     draws = exact_noise(joint_anomalies, cholesky(noise), rng)
+    # The gain transposed, (..., m, d), since members are rows
     gain = _solve_gain(anomalies, predicted_anomalies, noise)
     # x_i + K (y* - h(x_i) - ζ_i).
     innovations = observed[..., None, :] - predicted - draws
@@ -225,6 +229,7 @@ def etkf(
     n = ensemble.shape[-2]
     mean, anomalies = center_ensemble(ensemble)
     predicted_mean, predicted_anomalies = center_ensemble(predicted)
+    # The gain transposed, (..., m, d), since members are rows
     gain = _solve_gain(anomalies, predicted_anomalies, noise)
     # S = U D Vᵀ, so (I + S Sᵀ)^(-1/2) = I + U ((1 + D²)^(-1/2) - 1) Uᵀ.
     root = np.linalg.cholesky(noise)
@@ -244,7 +249,8 @@ def _rotate_members(anomalies: Array, rng: Rng) -> Array:
     """Apply a random rotation of the members (..., N, d) that keeps the vector of ones.
 
     Random signs and cosine transforms alternate in the space of centred members: orthogonal to
-    rounding, in N log N steps instead of the N³ of a random matrix.
+    rounding, in N log N steps instead of the N³ of a random matrix. The members are given by their
+    anomalies, whose mean is zero.
     """
     from scipy.fft import dct
 

@@ -124,6 +124,7 @@ def warn_of_weights(
         warn_of_collapse(problem)
         return
     m = observed.shape[-1]
+    # Of each observation from the mean of its predictions, in units of their covariance
     distances = _mahalanobis_squared(predicted, observed, noise)
     largest_distance = np.nanmax(distances, initial=0.0)
     # If the ensemble is consistent, the squared distance has a chi-squared distribution with m
@@ -141,7 +142,8 @@ def _mahalanobis_squared(predicted: Array, observed: Array, noise: Array) -> Arr
     """Return the squared Mahalanobis distance of each observation from its predictions, (...).
 
     It is (y - ȳ)' (C + R)⁻¹ (y - ȳ), with the predictions' mean ȳ and covariance C. Shapes are
-    those of :func:`warn_of_weights`; the distance is NaN where a component is.
+    those of :func:`warn_of_weights`; the distance is NaN where a component is. R is the noise's
+    covariance.
     """
     mean = predicted.mean(axis=-2, keepdims=True)
     innovation = observed - mean[..., 0, :]
@@ -202,6 +204,7 @@ def systematic_counts(weights: Array, offset: Array) -> Indices:
     n = weights.shape[-1]
     # The ends of the intervals; rounding must not move the last one from 1.
     edges = weights.cumsum(axis=-1)
+    # A copy of the last edge, which the division in place would change on its way.
     edges /= edges[..., -1:].copy()
     # (k + offset) / N < edge holds for ceil(N edge - offset) values of k, and all N lie below 1.
     edges *= n
@@ -282,7 +285,8 @@ def add_jitter(
 
     If `is_copy` (..., N) says which particles are copies of others, only they are moved, and not
     shrunk towards the mean, as in C. Musso, N. Oudjane, F. Le Gland, in: Sequential Monte Carlo
-    Methods in Practice (2001) 247-271.
+    Methods in Practice (2001) 247-271. The covariance is C, (..., d, d), the bandwidth h, and the
+    draws (..., N, d).
     """
     # L ξ_i with C = L Lᵀ.
     noise = normal @ factor(covariance).mT
@@ -319,8 +323,9 @@ def log_likelihood(
 ) -> Array:
     """Return the log-likelihood of each particle's prediction (..., N, m), up to a constant.
 
-    A component that some particle cannot predict is left out. With `contradict` it is left out
-    only if no particle can: otherwise those that cannot have a likelihood of zero.
+    A component that some particle cannot predict is left out. With `contradict` it is left out only
+    if no particle can: otherwise those that cannot have a likelihood of zero. Observations are
+    (..., m); `noise` is the covariance R of their noise, (m, m) or (..., m, m).
 
     >>> predicted = np.array([[1.0], [np.nan]])
     >>> log_likelihood(predicted, np.array([1.0]), np.eye(1), contradict=True)
@@ -355,7 +360,8 @@ def log_likelihood(
 def log_normalizer(observed: Array, noise: Array) -> Array:
     """Return the constant that :func:`log_likelihood` leaves out, (...), of observations (..., m).
 
-    Missing components, which are NaN, do not count.
+    Missing components, which are NaN, do not count. The covariance of the noise is (m, m) or
+    (..., m, m).
 
     >>> log_normalizer(np.array([[0.0, 0.0], [0.0, np.nan]]), np.eye(2)).round(4)
     array([-1.8379, -0.9189])

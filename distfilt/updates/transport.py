@@ -47,7 +47,11 @@ def _perturb(predicted: Array, noise: Array, factor: float, rng: Rng) -> Array:
 
 
 def _condition(fit: Fit, predicted: Array, members: Array, observed: Array) -> Array:
-    """Fit a map to samples (y, x), and condition them on an observation by the composed map."""
+    """Fit a map to samples (y, x), and condition them on an observation by the composed map.
+
+    The samples are predictions (..., N, m) and members (..., N, d); the observation is (..., m).
+    The result is members (..., N, d) of the conditional distribution.
+    """
     return compose(call_user(fit, predicted, members), predicted, members, observed)
 
 
@@ -91,8 +95,10 @@ def transport_map_update(
     # Joint samples: predictions with noise, and members.
     perturbed = _perturb(predicted, noise, noise_factor, rng)
     try:
+        # The map that is fitted to the samples moves each member to the observation.
         return _condition(fit, perturbed, ensemble, observed)
     except ValueError:
+        # No map can be fitted to components that are combinations of others: they are left out.
         is_free = _find_independent(ensemble)
         if is_free.all():
             raise
@@ -115,20 +121,26 @@ def _find_independent(ensemble: Array) -> Mask:
     # long as its anomalies. The rounding of the mean, which has been subtracted, counts too.
     length = np.linalg.norm(r, axis=-2)
     part = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
-    n = np.sqrt(ensemble.shape[-2])
-    is_free = part > _ROUNDING * length + n * 32 * np.spacing(np.abs(centre))
+    # 32 units in the last place of the mean, in each of N anomalies
+    mean_rounding = np.sqrt(ensemble.shape[-2]) * 32 * np.spacing(np.abs(centre))
+    is_free = part > _ROUNDING * length + mean_rounding
     return np.asarray(is_free.reshape(-1, ensemble.shape[-1]).any(axis=0))
 
 
 def _condition_independent(
     fit: Fit, perturbed: Array, ensemble: Array, observed: Array, is_free: Mask
 ) -> Array:
-    """Condition the independent components of members (..., N, d); the others follow from them."""
+    """Condition the independent components of members (..., N, d); the others follow from them.
+
+    Predictions with noise are (..., N, m), and the observation is (..., m); `is_free` (d,) marks
+    the independent components.
+    """
     if not is_free.any():
         return ensemble
     free = ensemble[..., is_free]
     moved = _condition(fit, perturbed, free, observed)
-    # z - m_z = (x - m_x) B, exactly
+    # The dependent components z are an affine function of the independent x: in anomalies
+    # z - m_z = ((x - m_x) / std) B, exactly, with the factors B found by least squares.
     centre = free.mean(axis=-2, keepdims=True)
     rest = ensemble[..., ~is_free]
     rest_centre = rest.mean(axis=-2, keepdims=True)
@@ -212,6 +224,7 @@ def principal_components(
     >>> post.var(axis=0).round(1)
     array([0.8, 1. ])
     """
+    # Predictions with a draw of the noise
     perturbed = _perturb(predicted, noise, noise_factor, rng)
     Bounds(at_most=ensemble.shape[-1])(n_state, "n_state")
     # An agent with few observations uses all of them.
@@ -222,6 +235,7 @@ def principal_components(
     latent = ensemble @ directions
     latent_predicted = perturbed @ observed_directions
     latent_observed = (observed[..., None, :] @ observed_directions)[..., 0, :]
+    # The map that is fitted to these samples moves each member to the observation.
     analysis = _condition(fit, latent_predicted, latent, latent_observed)
     # Back to the state: W v alone, or x_i + W (v_i' - v_i) with the directions W.
     if complement == "literal":

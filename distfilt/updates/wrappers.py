@@ -67,6 +67,7 @@ def _apply_after(update: Update, change: Callable[[Array], Array]) -> Update:
         analysis = call_user(update, ensemble, predicted, observed, noise, **options)
         return change(analysis)
 
+    # Attributes from which a filter learns which options the update takes: see `has_tag`.
     for tag in ("repredicts", "locates"):
         vars(update_and_change)[tag] = has_tag(update, tag)
     vars(update_and_change)["locate"] = find_locate(update)
@@ -242,6 +243,7 @@ def with_augmentation(
     def augment(
         ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
     ) -> Array:
+        # m observations and s constraints
         m = predicted.shape[-1]
         s = value.size
         # (h, g) is observed as (y*, d) with the covariance diag(R, std² I).
@@ -250,6 +252,7 @@ def with_augmentation(
         joint_noise = np.zeros((*noise.shape[:-2], m + s, m + s))
         joint_noise[..., :m, :m] = noise
         joint_noise[..., m:, m:] = std**2 * np.eye(s)
+        # One update by both
         analysis = call_user(
             update,
             ensemble,
@@ -474,10 +477,16 @@ def _check_periods(period: Array | float, k: int) -> Array:
 def _make_locate(
     given: Mapping[Sensor, object] | Callable[[Sensor], object], k: int
 ) -> Callable[[Sensor], Array]:
-    """Return a function that gives the places (sensor.dim, k) of a sensor's components."""
+    """Return a function that gives the places (sensor.dim, k) of a sensor's components.
+
+    A place is (k,). Given is a mapping from sensors to places, or a function of a sensor.
+    """
 
     def locate(sensor: Sensor) -> Array:
-        """Look the sensor up, or call the user's function; repeat one place for all components."""
+        """Look the sensor up, or call the user's function; repeat one place for all components.
+
+        The places are (sensor.dim, k).
+        """
         if isinstance(given, Mapping):
             if sensor not in given:
                 raise ValueError(
@@ -488,6 +497,7 @@ def _make_locate(
         else:
             value = call_user(given, sensor)
         place = np.asarray(check_array(value, "observation_places", (...,)))
+        # One place for the sensor, or one for each component of its observation.
         if place.shape not in ((k,), (sensor.dim, k)):
             raise ValueError(
                 f"observation_places must have shape ({k},) or ({sensor.dim}, {k}) for a "
@@ -540,14 +550,18 @@ def _apply_in_turn(update: Update, find_taper: Taper | None) -> Update:
         observation_places: Annotated[ArrayInput, "... m k"] | None = None,
     ) -> Array:
         d = ensemble.shape[-1]
+        # Factors (..., d + m, m) of the changes that each observation makes in each component of
+        # the state, and in each prediction.
         taper: Array | None = None
         if find_taper is None and observation_places is not None:
             raise ValueError("observation_places must be None without a localisation")
         if find_taper is not None:
             taper = find_taper(d, predicted.shape[-1], observation_places)
+        # An observation (..., m) that some member cannot predict counts as missing: NaN.
         is_predicted = ~np.isnan(predicted).any(axis=-2)
-        present = np.where(is_predicted, observed, np.nan)
-        turns = _plan_turns(present, noise, taper)
+        usable = np.where(is_predicted, observed, np.nan)
+        # Each turn is a group of observations that are assimilated together.
+        turns = _plan_turns(usable, noise, taper)
         for number, turn in enumerate(turns):
             # The first group uses the filter's own predictions, later ones those of moved members.
             if predict is not None and number:
@@ -564,6 +578,7 @@ def _apply_in_turn(update: Update, find_taper: Taper | None) -> Update:
                 predicted = analysis[..., d:]
         return ensemble
 
+    # Tags, attributes by which a filter knows how to call the update: it takes `predict`.
     vars(update_in_turn)["repredicts"] = True
     # The update takes NaN for missing observations itself: with a taper they must stay in the
     # array, so that every observation keeps its column of the taper.
@@ -597,6 +612,7 @@ class _Group:
         the taper of localisation, (..., d + m, m), which is 1 near an observation and 0 far from
         it. `predicted` is (..., N, m).
         """
+        # The update gets these observations, and of them those that are not missing.
         group = self.indices
         analysis = with_missing(
             update,
@@ -654,6 +670,7 @@ class _Combination:
         """
         # Combinations are made only where there is a taper, (..., d + m, m).
         taper = cast(Array, taper)
+        # The predictions h_j (..., N, g) that are combined, and whether all of them exist, (...)
         parts, is_predicted = self._select_parts(predicted)
         combined = (self.weights[..., None, :] * parts).sum(axis=-1, keepdims=True)
         mean = combined.mean(axis=-2, keepdims=True)
@@ -661,12 +678,15 @@ class _Combination:
         x = state - state.mean(axis=-2, keepdims=True)
         z = combined - mean
         variance = (z * z).sum(axis=(-2, -1))
+        # The tapered covariances of state and combination, (..., k), and the latter's tapered
+        # variance, (...). All moments here are N - 1 times as large, which cancels.
         tapered = self._taper_moments(x, parts, taper)
         # Without variance there is no gain; NaN leaves the ensemble as it is.
         is_used = (variance > 0) & (tapered.variance > 0) & is_predicted
         target = np.where(is_used, self.value, np.nan)[..., None]
         # The update gets a prediction that is scaled to the tapered variance. It is also appended
-        # to the state, so that its own change is known afterwards.
+        # to the state, so that its own change is known afterwards. The noise of a combination has
+        # the variance 1.
         ratio = np.ones_like(variance)
         np.divide(tapered.variance, variance, out=ratio, where=is_used)
         z = np.sqrt(ratio)[..., None, None] * z
@@ -687,6 +707,7 @@ class _Combination:
         remainder = change[..., :n_state] - c * (x.mT @ z).mT
         rho = taper[..., self.indices]
         mean_taper = self._average_taper(rho[..., :n_state, :])
+        # The axis None is that of the members.
         return np.asarray(state + by_gain + mean_taper[..., None, :] * remainder)
 
     def _taper_moments(self, x: Array, parts: Array, taper: Array) -> _TaperedMoments:
@@ -719,6 +740,7 @@ class _Combination:
         parts = predicted[..., self.indices]
         has_weight = np.broadcast_to(self.weights[..., None, :] != 0, parts.shape)
         parts = np.where(has_weight, parts, 0.0)
+        # Every prediction that has a weight exists, for all members.
         is_predicted = np.asarray(np.isfinite(parts).all(axis=(-2, -1)))
         return np.where(is_predicted[..., None, None], parts, 0.0), is_predicted
 
@@ -737,6 +759,8 @@ def _plan_turns(
     Observations are (..., m), their noise covariance (..., m, m), the taper (..., d + m, m).
     """
     turns: list[_Group | _Combination] = []
+    # Correlations up to this one count as rounding. Groups are the observations (indices) that
+    # larger ones connect.
     rounding = 0.0 if taper is None else _ROUNDING
     for group in _group_correlated(noise, rounding):
         # Observations in one place have the same taper: they can be assimilated together, as all
@@ -749,6 +773,7 @@ def _plan_turns(
         if is_one_place:
             turns.append(_Group(group, observed, noise))
         else:
+            # As many combinations of them with independent noise
             turns.extend(_whiten(group, observed[..., group], noise))
     return turns
 
@@ -778,7 +803,11 @@ def _whiten(group: Indices, observed: Array, noise: Array) -> list[_Combination]
 
 
 def _check_places(n_state: int, shape: tuple[int, ...], d: int, m: int) -> None:
-    """Raise an error unless there are coordinates for d components and m observations."""
+    """Raise an error unless there are coordinates for d components and m observations.
+
+    The coordinates of components are `n_state` rows, and those of the observations have a shape
+    (..., rows, k).
+    """
     if (n_state, shape[-2]) != (d, m):
         raise ValueError(
             f"places must have {d} rows and observation_places {m}, one for each "

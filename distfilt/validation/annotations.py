@@ -69,7 +69,8 @@ class CallContext:
         """Return a dimension's size, sizes of several axes, or the name while it is free."""
         if name in self.dimensions:
             return self.dimensions[name]
-        # A path such as model.dim starts at an argument.
+        # A path such as model.dim starts at an argument; a star before it says that it stands for
+        # several axes.
         argument, *attributes = name.lstrip("*").split(".")
         value = self.arguments.get(argument)
         for attribute in attributes:
@@ -92,6 +93,7 @@ class ShapeNames:
     @classmethod
     def parse(cls, words: Sequence[str]) -> ShapeNames:
         """Read the words of a shape such as ``"... N model.dim"``."""
+        # A number is a size, "..." stands for any leading axes, other words are names.
         names: list[int | str | EllipsisType] = []
         for word in words:
             if word.isdigit():
@@ -118,7 +120,8 @@ class ArgumentConstraint:
     def validate(self, value: object, name: str, context: CallContext) -> object:
         """Return the value as the function gets it, or raise an error that names it.
 
-        A conversion raises TypeError for a value of a wrong type.
+        A conversion raises TypeError for a value of a wrong type. The context has the other
+        arguments of the call and the sizes of axes so far.
         """
         try:
             result = self.convert(value, name, context)
@@ -232,7 +235,8 @@ def _convert_array(
     """Return an array of real numbers, booleans or integers, by its dtype, of a declared shape.
 
     A wrong type raises a TypeError without a message, which :meth:`ArgumentConstraint.validate`
-    writes.
+    writes. `allow_nan` says whether NaN may stand for missing numbers; the context has the call's
+    sizes of axes so far.
     """
     if dtype is np.float64:
         array: Array | Mask | Indices = check_array(value, name, finite=not allow_nan)
@@ -242,7 +246,8 @@ def _convert_array(
             )
     else:
         array = np.asarray(value)
-        # Signed or unsigned integers; a float array of whole numbers is none of them.
+        # numpy's letters: "b" are booleans, "iu" integers with and without a sign. A float array of
+        # whole numbers is none of them.
         dtype_kinds = "b" if dtype is np.bool_ else "iu"
         is_masked = isinstance(value, np.ma.MaskedArray)
         if array.dtype.kind not in dtype_kinds or is_masked:
@@ -261,6 +266,7 @@ def _hint_at_column(shape: tuple[int, ...], context: CallContext) -> str:
     """Return a hint at an earlier argument whose column of numbers made this shape look wrong.
 
     A column (n, 1) has bound the size of an axis to 1, where n was meant. Without one return "".
+    The context has the arguments of the call.
     """
     for name, value in context.arguments.items():
         column = np.shape(value) if isinstance(value, np.ndarray | list) else ()
@@ -294,6 +300,7 @@ def _convert_tuple(
         )
     result = []
     for constraint, item in zip(constraints, entries, strict=True):
+        # None allows any value.
         if constraint is not None:
             item = constraint.validate(item, name, context)
         result.append(item)
@@ -321,8 +328,11 @@ def _convert_union(
         try:
             return constraint.validate(value, name, context)
         except ValueError as error:
+            # The next alternative may take the value, unless there is none, or the value is a
+            # number of the right type out of bounds.
             if len(alternatives) == 1 or _is_out_of_bounds(value, constraint, error):
                 raise
+    # The message is written where this is caught.
     raise TypeError
 
 
@@ -379,6 +389,7 @@ def make_constraint(annotation: object) -> ArgumentConstraint | None:
     if origin is Literal:
         options = ", ".join(map(str, args))
         return ArgumentConstraint(f"one of {options}", partial(_check_option, args))
+    # Annotations of numpy's arrays are those of ndarray with a dtype.
     if origin is np.ndarray:
         return _make_array(annotation)
     if origin in _SEQUENCES:
@@ -394,7 +405,10 @@ def make_constraint(annotation: object) -> ArgumentConstraint | None:
 
 
 def _make_sequence(origin: object, args: tuple[object, ...]) -> ArgumentConstraint:
-    """Return the constraint of a sequence of any length, or of a tuple of a fixed one."""
+    """Return the constraint of a sequence of any length, or of a tuple of a fixed one.
+
+    The annotation is ``origin[args]``.
+    """
     # tuple[X, Y] has a fixed length, tuple[X, ...] any.
     if origin is tuple and args[-1] is not ...:
         constraints = tuple([make_constraint(arg) for arg in args])
@@ -431,8 +445,10 @@ def _make_annotated(
 ) -> ArgumentConstraint | None:
     """Return the constraint of a type with a shape and rules beside it.
 
-    Of several shapes the last one counts, so that an alias with a shape can be narrowed.
+    Of several shapes the last one counts, so that an alias with a shape can be narrowed. Of
+    ``Annotated[base, *metadata]`` the metadata has shapes, ALLOW_NAN and rules.
     """
+    # Strings among the metadata are shapes, functions are rules.
     base = _resolve_alias(base)
     shapes = [note for note in metadata if isinstance(note, str) and note != ALLOW_NAN]
     if get_origin(base) is np.ndarray:
@@ -452,11 +468,15 @@ def _make_annotated(
 def _make_array(
     base: object, words: Sequence[str] | None = None, allow_nan: bool = False
 ) -> ArgumentConstraint:
-    """Return the constraint of an array, of any shape if there are no words for it."""
+    """Return the constraint of an array, of any shape if there are no words for it.
+
+    `base` is the array type of an annotation, and the words name its axes. NaN is allowed or not.
+    """
     # NDArray[X] is ndarray[shape, dtype[X]].
     dtype = get_args(get_args(base)[1])[0]
     entries = {np.float64: "real numbers", np.bool_: "True and False"}
     description = f"an array of {entries.get(dtype, 'integers')}"
+    # The names of the axes, if the array must have a certain shape.
     shape = None
     if words is not None:
         description += f" of shape ({', '.join(words)})"

@@ -150,14 +150,18 @@ def all_finite(value: Array) -> bool:
 
 
 def _convert_to_float64(value: object, name: str) -> Array:
-    """Convert a value that holds real numbers and nothing else."""
+    """Convert a value that holds real numbers and nothing else.
+
+    Refuse any other by its type; the name is the argument's, for the error.
+    """
     wrong_type = type_name(value)
     culprit = value
     try:
         # The entries of a list are checked before numpy converts them to a common type.
         parts = value if isinstance(value, list | tuple) else (value,)
         array = np.asarray(value)
-        # An array of objects may hold numbers, and anything else.
+        # An array of objects, numpy's letter "O", may hold numbers, and anything else. "f", "i" and
+        # "u" are floats and integers with and without a sign, "U" is text.
         entries = list(array.ravel()) if array.dtype.kind == "O" else []
         if entries:
             culprit = entries[0]
@@ -194,6 +198,7 @@ def describe_conversion(value: object) -> str:
         return ": a missing number is NaN"
     if isinstance(value, np.ma.MaskedArray):
         return ": give x.filled(np.nan), a missing number is NaN"
+    # numpy's letters of types: "m" is a length of time, "M" a date.
     kind = value.dtype.kind if isinstance(value, np.ndarray | np.generic) else ""
     if kind == "m" or isinstance(value, timedelta):
         return ': give seconds, x / np.timedelta64(1, "s")'
@@ -257,6 +262,7 @@ def describe_misshape(shape: tuple[int, ...], expected: Shape) -> str:
     >>> describe_misshape((), (1, 1)), describe_misshape((1,), (1, 1))
     (': give [[x]], a matrix of one number', ': give [x], a matrix of one number')
     """
+    # The number of entries that the last axis should have
     size = expected[-1] if expected else None
     if shape[-1:] == (1,) and len(shape) > 1 and shape[-2] == size != 1:
         return ": a column, give x[:, 0]"
@@ -283,6 +289,8 @@ def format_number(value: float) -> str:
 def check_positive_definite(value: Array, name: str) -> None:
     """Refuse a matrix, or a stack with one, that is not symmetric positive definite.
 
+    The value is (..., d, d); the name is the argument's, for the error.
+
     Examples
     --------
     >>> check_positive_definite(np.array([[1.0, 2.0], [2.0, 1.0]]), "noise")
@@ -298,10 +306,14 @@ def check_positive_definite(value: Array, name: str) -> None:
 def check_positive_semidefinite(value: Array, name: str) -> None:
     """Refuse a matrix, or a stack with one, that is not symmetric positive semidefinite.
 
+    The value is (..., d, d); the name is the argument's, for the error.
+
     Examples
     --------
     >>> check_positive_semidefinite(np.zeros((2, 2)), "noise")
     """
+    # A variance of zero is that of a constant; in a stack, which is not searched, some may be. A
+    # diagonal matrix of nonnegative numbers is semidefinite.
     has_constants = value.ndim != 2 or np.count_nonzero(value.diagonal()) < len(value)
     if has_constants and is_nonnegative_diagonal(value):
         return
@@ -333,7 +345,10 @@ def is_nonnegative_diagonal(value: Array) -> bool:
 
 
 def _check_symmetric(value: Array, name: str) -> None:
-    """Refuse matrices that are not square or not symmetric up to rounding."""
+    """Refuse matrices that are not square or not symmetric up to rounding.
+
+    They are (..., d, d); the name is the argument's, for the error.
+    """
     if value.ndim < 2 or value.shape[-1] != value.shape[-2]:
         raise ValueError(f"{name} must be a square matrix, got shape {value.shape}")
     # Equal bytes are the rule, and compared in a fifth of a difference's time.
@@ -349,7 +364,10 @@ def _check_symmetric(value: Array, name: str) -> None:
 
 
 def _has_cholesky(value: Array) -> bool:
-    """Whether all matrices of a stack have a Cholesky factor."""
+    """Whether all matrices of a stack have a Cholesky factor.
+
+    They are (..., d, d).
+    """
     if value.ndim == 2 and value.size:
         # LAPACK itself takes a fifth of numpy's time for one matrix.
         _factor, failed = dpotrf(value, lower=1)
@@ -369,10 +387,11 @@ def _drop_constants(value: Array) -> Array:
     """
     if value.ndim > 2:
         return value
-    kept = np.flatnonzero(value.diagonal())
-    if kept.size == len(value):
+    # The components that have a variance
+    not_constant = np.flatnonzero(value.diagonal())
+    if not_constant.size == len(value):
         return value
-    part = value[kept][:, kept]
+    part = value[not_constant][:, not_constant]
     # Beside a zero on the diagonal, anything but zeros makes the matrix indefinite.
     return part if np.count_nonzero(part) == np.count_nonzero(value) else value
 
@@ -384,7 +403,11 @@ def _smallest_eigenvalues(value: Array) -> Array:
 
 
 def _raise_not_positive(value: Array, name: str, smallest: Array, kind: str) -> None:
-    """Raise the error that gives the worst matrix's smallest eigenvalue and its index."""
+    """Raise the error that gives the worst matrix's smallest eigenvalue and its index.
+
+    The smallest eigenvalues (...) are those of matrices scaled to unit variances; `kind` is
+    definite or semidefinite.
+    """
     # The first matrix of the stack with the smallest eigenvalue, which is given in its own units.
     index = tuple(np.argwhere(smallest == smallest.min())[0].tolist())
     eigenvalue = np.linalg.eigvalsh(value[index])[0]
@@ -407,6 +430,8 @@ def _to_unit_variances(cov: Array) -> Array:
 
 def check_probabilities(value: Array, name: str) -> None:
     """Refuse weights that are negative or do not sum to one along the last axis.
+
+    The value is (..., N); the name is the argument's, for the error.
 
     Examples
     --------
@@ -434,6 +459,8 @@ def check_probabilities(value: Array, name: str) -> None:
 
 def check_increasing(value: Array, name: str) -> None:
     """Refuse numbers that do not strictly increase.
+
+    The value is (T,); the name is the argument's, for the error.
 
     Examples
     --------

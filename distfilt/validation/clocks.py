@@ -43,6 +43,7 @@ def warn_of_unit(t: float, name: str) -> None:
     size = abs(t)
     if size < _LONGEST:
         return
+    # Unix times of our years are about 1.7e9 s, which is 1.7e12 ms, 1.7e15 µs and 1.7e18 ns.
     unit = "nanoseconds"
     if size < 1e14:
         unit = "milliseconds"

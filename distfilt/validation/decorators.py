@@ -48,6 +48,7 @@ class SignatureConstraints:
     @cached_property
     def constraints(self) -> dict[str, ArgumentConstraint]:
         """Constraints by parameter, those of arrays last."""
+        # The function's own annotations, unless others have been given in their place.
         function = self.function
         annotations = self.annotations
         if annotations is None:
@@ -112,6 +113,7 @@ class SignatureConstraints:
         if len(args) <= n_allowed or has_more or not names:
             return
         name = self.function.__name__
+        # The error shows how to give the first of them by name, unless its value is long.
         options = ", ".join(f"{option}=" for option in names)
         example = f"{names[0]}={args[n_allowed]!r}"
         hint = f", such as {example}" if len(example) < 40 else ""
@@ -191,11 +193,13 @@ def validated(
     ValueError: factor must be positive, got -1.0
     """
     constraints = SignatureConstraints(function, annotations)
+    # The function that is called with checked arguments, unless the library itself calls
     outermost = function if call is None else call
 
     @wraps(function)
     def wrapper(*args: object, **options: object) -> object:
-        # Arguments of a nested call come from the library.
+        # Arguments of a nested call come from the library. `_NESTED` holds for this thread and
+        # task only, and the token restores what it was.
         if _NESTED.get():
             return function(*args, **options)
         arguments = constraints.validate(args, options)
@@ -272,6 +276,7 @@ def call_user(function: Callable[..., R], *args: object, **options: object) -> R
     module = getattr(unwrapped, "__module__", None) or ""
     if module.startswith("distfilt."):
         return function(*args, **options)
+    # Inside a user's function validated functions check their arguments.
     token = _NESTED.set(False)
     try:
         return function(*args, **options)
@@ -337,6 +342,7 @@ class FrozenModel:
         instance = object.__new__(cls)
         dataclass = cast(Hashable, cls)
         names, factories = _list_fields(dataclass)
+        # The dictionary takes the fields, since a frozen dataclass cannot be assigned to.
         values = vars(instance)
         values.update(zip(names, args, strict=False), **options)
         for name, factory in factories:

@@ -47,12 +47,16 @@ def needs_check(owner: object, check: str) -> bool:
 
 
 def mark_checked(owner: object, check: str) -> None:
-    """Record that a check of an owner's functions has been made."""
+    """Record that a check of an owner's functions has been made.
+
+    The arguments are those of :func:`needs_check`.
+    """
     key = id(owner)
     if key not in _CHECKED:
         _CHECKED[key] = set()
-        # Ids are reused, so the entry goes when the owner does.
+        # When the owner is deleted, so is its entry: its id may become that of another object.
         finalizer = weakref.finalize(owner, _CHECKED.pop, key, None)
+        # At the interpreter's end there is nothing to tidy up.
         finalizer.atexit = False
     _CHECKED[key].add(check)
 

@@ -64,7 +64,11 @@ def sort_arrays_last(
 def _evaluate(
     annotation: str, module: str, names: Mapping[str, object], argument: str
 ) -> object:
-    """Evaluate an annotation that is kept as a string."""
+    """Evaluate an annotation that is kept as a string.
+
+    Names are those of the module in which it stands; `argument` says for the error whose annotation
+    it is.
+    """
     try:
         return eval(annotation, dict(names))
     except NameError:
