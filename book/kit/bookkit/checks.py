@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import ast
 import os
-from html import escape
 from typing import Any
 
 import numpy as np
 import pandas as pd
+
+from .tables import finish_table
 
 __all__ = ["Checks", "SoftAssert", "use_soft_assert"]
 
@@ -120,9 +121,7 @@ class Checks:
 
     def _repr_html_(self) -> str:
         page = self.frame.to_html(index=False, border=0)
-        # pandas has no caption; a page expects it before the head.
-        head = f"<caption>{escape(self.caption)}</caption>\n<thead>"
-        return str(page).replace("<thead>", head, 1)
+        return finish_table(str(page), self.caption)
 
 
 class SoftAssert(ast.NodeTransformer):

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from html import escape
 
 import pandas as pd
 
-__all__ = ["ResultTable"]
+__all__ = ["ResultTable", "finish_table"]
+
+
+def finish_table(page: str, caption: str) -> str:
+    """Return a table's HTML with a caption before its head, and ``*words*`` in italics.
+
+    >>> finish_table("<table><thead></thead></table>", "Errors in *range*")
+    '<table><caption>Errors in <em>range</em></caption>\\n<thead></thead></table>'
+    """
+    # pandas has no caption; a page expects it before the head.
+    head = f"<caption>{escape(caption)}</caption>\n<thead>"
+    page = page.replace("<thead>", head, 1)
+    return re.sub(r"\*(\w+)\*", r"<em>\1</em>", page)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -58,6 +71,4 @@ class ResultTable:
             pairs = zip(self.frame[name], map(escape, self._format(name)), strict=True)
             cells[name] = [f"<b>{t}</b>" if value == best else t for value, t in pairs]
         page = self.frame.assign(**cells).to_html(escape=False, border=0)
-        # pandas has no caption; a page expects it before the head.
-        head = f"<caption>{escape(self.caption)}</caption>\n<thead>"
-        return str(page).replace("<thead>", head, 1)
+        return finish_table(str(page), self.caption)
