@@ -155,11 +155,16 @@ def difference_with_error(
     step: float = _STEP,
     scale: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Derivative as :func:`central_difference`, and a bound of its rounding error, (..., m, d)."""
+    """Derivative as :func:`central_difference`, and a bound of its rounding error, (..., m, d).
+
+    The `scale` (..., d) has the standard deviations of the components of states x (..., d).
+    """
+    # Up to how far the derivative is needed, (..., d): a component's size where nothing is known.
     size = np.maximum(1.0, np.abs(x))
     deviation = size if scale is None else np.broadcast_to(scale, x.shape)
-    # Slopes of the given step, or of shorter ones where the function bends within it.
+    # Slopes of the given step, or of shorter ones where the function bends within it, (..., d, m)
     refined = _refine_differences(function, x, difference, step)
+    # The differences over the given step itself
     first = refined.first
     # The function may turn many times within a step that is longer than the deviation.
     is_long = (first.step > deviation) & (deviation > 0)
@@ -513,6 +518,7 @@ def evaluate_derivative(
                     f"{name} has no usable differences: its derivative over two steps differs, "
                     "by rounding or since it is not smooth; give derivative=",
                     RuntimeWarning,
+                    # The warning points at the call of jacobian(), above it and its validation.
                     stacklevel=4,
                 )
         return slope
@@ -522,6 +528,7 @@ def evaluate_derivative(
         warnings.warn(
             "derivative does not match finite differences of its function",
             RuntimeWarning,
+            # As above: at the call of jacobian()
             stacklevel=4,
         )
     return slope

@@ -30,6 +30,9 @@ from ..validation import (
 
 __all__ = ["Constraint", "norm_constraint", "project", "retract"]
 
+_Length = Annotated[float, Bounds(above=0, at_most=1e150)]
+"""A length whose square is finite."""
+
 Variant = Literal["printed", "reversed", "particle", "shift"]
 """Variants of (12) of Das and Bhattacharya: the gain times D_i - d̂, d̂ - D_i, d - D_i or d - d̂."""
 Motion = tuple[DistinctIndices, DistinctIndices]
@@ -104,7 +107,7 @@ class Constraint(FrozenModel):
 def norm_constraint(
     indices: DistinctIndices,
     *,
-    length: Annotated[float, Bounds(above=0, at_most=1e150)] = 1.0,
+    length: _Length = 1.0,
 ) -> Constraint:
     r"""Return the constraint that some components have a given norm, :math:`|\mathbf x_I|^2=L^2`.
 

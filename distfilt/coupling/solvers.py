@@ -35,7 +35,7 @@ __all__ = ["TransportPlan", "monotone_plan", "squared_distances", "transport_pla
 Solver = Literal["network", "entropic"]
 """POT's network simplex, or Newton's method on the entropic problem."""
 
-SQUARED = Bounds(at_least=-1e150, at_most=1e150)
+FINITE_SQUARE = Bounds(at_least=-1e150, at_most=1e150)
 """The range of numbers whose squares are finite."""
 _PIVOTS = 10_000_000
 """Largest number of pivots of the network simplex; more mean that it cycles."""
@@ -569,8 +569,8 @@ def _correct_marginals(matrix: Array, a: Array, b: Array) -> Array:
 
 @validated
 def monotone_plan(
-    source: Annotated[ArrayInput, "n", SQUARED],
-    target: Annotated[ArrayInput, "m", SQUARED],
+    source: Annotated[ArrayInput, "n", FINITE_SQUARE],
+    target: Annotated[ArrayInput, "m", FINITE_SQUARE],
     rows: Annotated[Probabilities, "n"],
     columns: Annotated[Probabilities, "m"] | None = None,
 ) -> TransportPlan:

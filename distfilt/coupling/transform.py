@@ -34,7 +34,14 @@ from ..validation import (
     check_array,
     validated,
 )
-from .solvers import SQUARED, Solve, Solver, scale_cost, solver_of, squared_distances
+from .solvers import (
+    FINITE_SQUARE,
+    Solve,
+    Solver,
+    scale_cost,
+    solver_of,
+    squared_distances,
+)
 
 __all__ = [
     "correct_moments",
@@ -45,9 +52,9 @@ __all__ = [
     "transport_plans",
 ]
 
-SquarableEnsemble = Annotated[ArrayInput, "... n d", SQUARED]
+SquarableEnsemble = Annotated[ArrayInput, "... n d", FINITE_SQUARE]
 """Members whose squared distances are finite."""
-Forecast = Annotated[ArrayInput, "*transformed.shape", SQUARED]
+Forecast = Annotated[ArrayInput, "*transformed.shape", FINITE_SQUARE]
 """Members before the transform."""
 Cost = Literal["squared", "distance"]
 """The squared Euclidean distance of two members, or the distance itself."""
@@ -117,6 +124,8 @@ def _warn_of_likelihoods(logs: Array) -> None:
         f"log_weights must be logarithms, got numbers from {least[k]:g} to {largest[k]:g}, as "
         "likelihoods or weights are: take np.log of them",
         RuntimeWarning,
+        # The warning points at the call of the rule: above are `normalize_weights`, the rule, and
+        # its validation.
         stacklevel=5,
     )
 
@@ -489,7 +498,7 @@ def _factor_by_size(covariance: Array) -> Array:
 
 @validated
 def rejuvenate(
-    transformed: Annotated[Ensemble, SQUARED],
+    transformed: Annotated[Ensemble, FINITE_SQUARE],
     ensemble: Forecast,
     *,
     bandwidth: NonNegativeFloat,
@@ -536,7 +545,7 @@ def rejuvenate(
 
 @validated
 def transform_within(
-    ensemble: Annotated[ArrayInput, "n d", SQUARED],
+    ensemble: Annotated[ArrayInput, "n d", FINITE_SQUARE],
     log_weights: ArrayLike,
     pieces: Annotated[IndicesInput, "n"],
     *,

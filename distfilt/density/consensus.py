@@ -159,7 +159,9 @@ class PIConsensus(FrozenModel, ConsensusProtocol):
         k is the number of cells or of cosine coefficients; the last column counts the agents. The
         integrals are zero, and the inputs those of the present positions.
         """
+        # Each agent's kernel on the cells, or its cosine coefficients, and last the indicator
         inputs = _encode(snapshot, self.modes, snapshot.kernels)
+        # Before any exchange an agent's estimate is its own kernel, or a Gaussian about itself.
         estimates = inputs
         if self.initial_std is not None:
             gaussians = snapshot.initial_gaussians(self.initial_std)

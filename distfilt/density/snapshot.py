@@ -104,7 +104,8 @@ class SwarmSnapshot(FrozenModel):
         Parameters
         ----------
         density : ndarray, (F, n)
-            The density p for which the strength is computed, for each local agent.
+            The density p for which the strength is computed, in the n cells, for each of the F
+            agents of `local`, or for all A without it.
         agents : array_like
             Number of agents whose kernels are averaged in each of all A estimates. Absent agents
             have no estimate: their R is infinite.
@@ -117,8 +118,9 @@ class SwarmSnapshot(FrozenModel):
         # Every present agent knows at least itself.
         counts = np.where(self.present, np.maximum(agents, 1.0), 0.0)
         if self.local is not None:
+            # Numbers of the local agents
             counts = counts[list(self.local)]
-        # The constant k̄ is that of one agent, divided by the number of agents.
+        # The constant k̄ is that of one agent, divided by the number of agents, (F,).
         # Absent agents, without a kernel, have an infinite one.
         single = kernel_constant(self.grid, bandwidth=self.bandwidth, agents=1)
         constant = np.full(counts.shape, np.inf)

@@ -279,9 +279,9 @@ class _Problem:
     """Fusions whose weights are to be optimised, along the first axis n."""
 
     roots: Array
-    """L_b⁻¹ L₁ of each source, (n, S, d, d); zero where it is absent."""
+    """G_b = L_b⁻¹ L₁ of each source, with P_b = L_b L_bᵀ, (n, S, d, d); zero if it is absent."""
     information: Array
-    """P_b⁻¹ in the first source's coordinates, (n, S, d, d)."""
+    """P_b⁻¹ in the first source's coordinates L₁⁻¹ x, G_bᵀ G_b, (n, S, d, d)."""
     first_lower: Array
     """L₁, (n, d, d): traces are taken in the state's own coordinates."""
     present: Array
@@ -295,7 +295,7 @@ class _Problem:
         lower = cholesky(covs)
         roots = solve_lower(lower, np.broadcast_to(lower[:, :1], lower.shape))
         roots *= present[..., None, None]
-        information = _square(roots.mT)
+        information = _times_transpose(roots.mT)
         return cls(roots, information, lower[:, 0], present, determinant)
 
     def select(self, mask: Mask) -> _Problem:
@@ -314,21 +314,27 @@ class _Problem:
     def derivatives(self, weights: Array) -> tuple[Array, Array, Array]:
         """The objective (n,), minus its gradient g (n, S), its second derivatives (n, S, S)."""
         n, s, d = self.roots.shape[:3]
-        # M = Σ ω_b P_b⁻¹ = C Cᵀ
+        # All in the first source's coordinates: M = Σ ω_b P_b⁻¹ = C Cᵀ with the factor C, `lower`,
+        # and P_b⁻¹ = G_bᵀ G_b with the roots G_b. Each P_b⁻¹ is a row, and the sum a product.
         flat_information = self.information.reshape(n, s, d * d)
         total = weights[:, None, :] @ flat_information
-        no_identity = np.zeros((1, 1))
-        lower = _factor_sum(total.reshape(n, d, d), no_identity, weights, self.roots)
-        # C⁻¹ G_bᵀ for all sources side by side, with the roots G_b
+        # The sum c I + Σ ω_b G_bᵀ G_b with c = 0
+        identity_weight = np.zeros((1, 1))
+        lower = _factor_sum(
+            total.reshape(n, d, d), identity_weight, weights, self.roots
+        )
+        # C⁻¹ G_bᵀ for all sources side by side, (n, d, S d)
         half = solve_lower(lower, self.roots.reshape(n, s * d, d).mT)
-        # C⁻¹ P_b⁻¹ C⁻ᵀ: each source's information where that of the result is the identity.
-        relative = _square(half.reshape(n, d, s, d).swapaxes(1, 2))
+        # C⁻¹ P_b⁻¹ C⁻ᵀ, (n, S, d, d): each source's information where that of the result is I.
+        relative = _times_transpose(half.reshape(n, d, s, d).swapaxes(1, 2))
         if self.determinant:
-            # -log det M, with g_b = tr(M⁻¹ P_b⁻¹) and the Hessian tr(M⁻¹ P_b⁻¹ M⁻¹ P_c⁻¹).
+            # -log det M, with g_b = tr(M⁻¹ P_b⁻¹) and the Hessian tr(M⁻¹ P_b⁻¹ M⁻¹ P_c⁻¹), the
+            # sum of products of the entries of `relative`.
             flat = relative.reshape(n, s, d * d)
             slope = np.einsum("nsii->ns", relative)
             return -log_det(lower), slope, flat @ flat.mT
-        # tr M⁻¹ = |C⁻¹ L₁ᵀ|², with g_b = tr(M⁻¹ P_b⁻¹ M⁻¹).
+        # In the state's own coordinates the result is L₁ M⁻¹ L₁ᵀ, with the factor L₁ of the first
+        # source's covariance. Its trace is |C⁻¹ L₁ᵀ|², with g_b = tr(L₁ M⁻¹ P_b⁻¹ M⁻¹ L₁ᵀ).
         root = solve_lower(lower, self.first_lower.mT)
         flat = (relative @ root[:, None]).reshape(n, s, d * d)
         slope = (flat @ root.reshape(n, d * d, 1))[..., 0]
@@ -466,7 +472,7 @@ def _decrease_bound(value: Array, predicted: Array) -> Array:
     return np.where(predicted > 0, bound, -np.inf)
 
 
-def _square(root: Array) -> Array:
+def _times_transpose(root: Array) -> Array:
     """A Aᵀ of small matrices; with a copy of Aᵀ in half the time of its view."""
     return np.asarray(root @ np.ascontiguousarray(root.swapaxes(-1, -2)))
 

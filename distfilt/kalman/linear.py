@@ -380,6 +380,7 @@ def prepend_prior_time(times: Array, observations: Array, sensor: Sensor) -> Arr
                 f"observations must be angles in rad, got some {turns:.0f} turns off: are "
                 "they in degrees?",
                 RuntimeWarning,
+                # The warning points at the call of mekf(), above it and its validation.
                 stacklevel=4,
             )
     return np.concatenate([[0.0], times])

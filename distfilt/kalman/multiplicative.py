@@ -247,13 +247,14 @@ def mekf(
             "observations must be predicted to be used, but a sensor cannot see from a mean "
             "(its prediction is NaN): these components are left out",
             RuntimeWarning,
+            # The warning points at the call of mekf(), above it and its validation.
             stacklevel=3,
         )
     return unflatten_runs(means, covs, log_likelihood, runs)
 
 
 class _Part(NamedTuple):
-    """A sensor, or some of its components: `rows` of the sensor, `columns` of all observations."""
+    """A sensor, or some of its components: `rows` of its own, `columns` of all observations (m)."""
 
     sensor: Sensor
     rows: slice
@@ -434,11 +435,13 @@ def _error_jacobian(
 
     By the chain rule it is the sensor's Jacobian times the tangent basis, H B(x). Present states x
     are (R, d), `previous` are those with which the parts of increments compare, and the covariance
-    of all errors is (R, K, K), k for each state.
+    of all errors is (R, K, K), k for each state. A part has the `rows` of its sensor's observation,
+    which are the `columns` of all observations.
     """
     basis = chart.tangent_basis(x)
     # The present errors come first in the joint covariance.
     k = chart.error_dim
+    # Of the states, (R, d): where a sensor has no derivative, differences reach about as far.
     std = deviations(basis @ cov[..., :k, :k] @ basis.mT)
     # The parts stand side by side, so that the last one ends behind all observations.
     n_observed = parts[-1].columns.stop

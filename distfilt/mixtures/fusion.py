@@ -308,9 +308,10 @@ def _fuse_together(
 ) -> list[GaussianMixture]:
     """Fuse each belief with those received as `fuse_mixtures` does, many in one call.
 
-    The targets are the beliefs' marginals.
+    The `targets` are the beliefs' marginals in the components that the messages are about.
     """
-    # Each message once; their precisions are computed in one call.
+    # Each message once, by its identity. All precisions are computed in one call, and each mixture
+    # stores its own.
     messages = {id(m): m for of_agent in received for m in of_agent}
     invert_together(list(messages.values()))
     # Receivers whose dimension, and whose messages, have the same sizes

@@ -52,6 +52,9 @@ Exponents = (
 Terms = Literal["matched", "all"]
 Rule = Literal["C1", "C2", "C3", "points"]
 Condition = Annotated[float, Bounds(above=1, at_most=1e150)]
+"""A condition number whose square is finite."""
+SingularValue = Annotated[float, Bounds(at_least=0, at_most=1e150)]
+"""A singular value whose square is finite."""
 
 # Density, relative to the largest, below which the rows of "points" stop gaining weight: farther
 # out than at a thousandth (3.7 deviations of a Gaussian) no accuracy is wanted.
@@ -261,22 +264,24 @@ class PartialFusion(FrozenModel):
         if shapes.n_components == 1:
             # By every rule a single component has all the weight.
             return shapes.with_equal_weights()
+        # The weight of a component is such that it has a given value at its mean. By C1 it is that
+        # of the fused density with one component of the prior alone, from which it has come.
         if rule == "C1":
             logs = self._log_values_by_source(shapes)
             return _weight_by_values(shapes.with_equal_weights(), logs)
+        # By C2 it is the exact density, of which these are the logarithms.
         logs = self.log_value(shapes.means)
         mixture = shapes.with_equal_weights()
-        # The exact density, as its logarithm, is the value of each component at its own mean.
         if rule == "C2":
             return _weight_by_values(mixture, logs)
         if shapes.n_components > at_most:
-            # C2 weights a component by its value over its peak; the largest weights come first.
+            # By C2 a weight is a value over the component's peak; the largest weights come first.
             order = np.argsort(mixture.log_peaks - logs, kind="stable")
             largest = np.isin(np.arange(shapes.n_components), order[:at_most])
             shapes = shapes.select(largest)
             logs = logs[largest]
             mixture = shapes.with_equal_weights()
-        # Least-squares coefficients of components with the peak 1
+        # Least-squares coefficients of components with the peak 1: their values at their means
         coefficients = self._collocate(mixture, logs, with_points=rule == "points")
         # A coefficient of zero has the logarithm -inf, and so the weight zero.
         with np.errstate(divide="ignore"):
@@ -572,8 +577,8 @@ def _factor_definite(matrices: Array, smallest_pivot: Array) -> tuple[Array, Mas
 
 @validated
 def tikhonov(
-    largest: Annotated[float, Bounds(at_least=0, at_most=1e150)],
-    smallest: Annotated[float, Bounds(at_least=0, at_most=1e150)],
+    largest: SingularValue,
+    smallest: SingularValue,
     *,
     condition: Condition = 1e10,
 ) -> float:

@@ -322,10 +322,16 @@ class LinearModel(Model):
         periods: PeriodsArgument = (),
         time_invariant: bool = False,
     ) -> LinearModel:
-        """Build the model from its matrix, ``transition_matrix(dt)`` or ``(t, dt)``, to (d, d)."""
+        """Build the model from its matrix, ``transition_matrix(dt)`` or ``(t, dt)``, to (d, d).
+
+        The covariance of a step's noise is ``noise_cov(t, dt)``, (d, d).
+        """
+        # The transition (x, t, dt) -> Φ x, with the matrix Φ of dt, or of t and dt
+        takes_time = _takes_time(transition_matrix)
+        transition = partial(_multiply, transition_matrix, dim, takes_time)
         return cls(
             dim,
-            partial(_multiply, transition_matrix, dim, _takes_time(transition_matrix)),
+            transition,
             noise_cov,
             names=names,
             units=units,
@@ -351,11 +357,12 @@ class LinearModel(Model):
         return self._compute_noise_cov(t, dt)
 
     def _compute_noise_cov(self, t: float, dt: float) -> Array:
-        """Compute what `_noise_cov` returns; once, check Φ against Q.
+        """Return the covariance Q of the noise of a step, (d, d).
 
-        The covariance is (d, d).
+        Once, it is compared with the transition matrix Φ, to see whether that is transposed.
         """
         cov = super()._noise_cov(t, dt)
+        # A step of no length has Φ = I, which shows nothing.
         if dt and is_first_use(self, "transition_matrix"):
             # The check calls the user's functions for half steps, at which they may fail, as a
             # table without such an entry does: then nothing is checked.

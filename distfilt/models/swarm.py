@@ -27,6 +27,9 @@ from .base import trajectory
 
 __all__ = ["RotatingMixture", "Swarm", "rotating_swarm"]
 
+_Strength = Annotated[float, Bounds(above=0, at_most=1e150)]
+"""A strength of noise whose square is finite."""
+
 Positions = Annotated[ArrayInput, "... self.dim"]
 
 
@@ -280,7 +283,7 @@ class RotatingMixture(FrozenModel):
 def rotating_swarm(
     interpretation: Literal["literal", "gibbs", "slowgibbs"] = "slowgibbs",
     *,
-    strength: Annotated[float, Bounds(above=0, at_most=1e150)] = 0.03,
+    strength: _Strength = 0.03,
     mixture: RotatingMixture | None = None,
 ) -> Swarm:
     """The swarm of Zheng and Lin's study, equation (23), in one of three interpretations.

@@ -78,10 +78,10 @@ def from_edges(
     return build_links(n_agents, pairs, name)
 
 
-def from_either(
+def from_matrix_or_edges(
     value: object, n_agents: int | None, name: str
 ) -> scipy.sparse.csr_array:
-    """Return the links of a matrix or of a list of edges, both ways."""
+    """Return the links of a matrix or of a list of edges, both ways, as a matrix (A, A)."""
     if scipy.sparse.issparse(value) or getattr(value, "dtype", None) == np.dtype(bool):
         return from_matrix(value, name, directed=False)
     numbers = check_array(value, name)

@@ -148,6 +148,7 @@ def _warn_of_changes(
             f"{rounds}, of which the last moved a mean by {change:.2g} of its deviation: they "
             "may need more, or not converge",
             RuntimeWarning,
+            # The warning points at the call of the rule, above it and its validation.
             stacklevel=4,
         )
 

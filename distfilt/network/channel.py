@@ -508,7 +508,8 @@ class Channel:
             matrix.data = entries[k]
             present_and_late = flat
             if offset:
-                # An agent's own value is of this round, those received are late. Appended
+                # An agent's own value is of this round, those received are late: this round's
+                # values join a queue, and those of earlier ones leave it, (R A, k). Appended
                 # below, they take part in the same product.
                 present_and_late = np.concatenate([flat, self._delay_values(flat)])
             flat = matrix @ present_and_late

@@ -29,6 +29,9 @@ from . import _links
 
 __all__ = ["Graph", "complete", "disk", "grid", "path", "ring", "star"]
 
+_FINITE_SQUARE = Bounds(at_least=-1e150, at_most=1e150)
+"""The range of coordinates whose squared distances are finite."""
+
 _DENSE = 200
 """Up to this many agents a dense eigenvalue solver is the faster one."""
 
@@ -451,7 +454,9 @@ def as_graph(
     elif scipy.sparse.issparse(value) or isinstance(value, np.ndarray | list | tuple):
         # Edges between names become edges between numbers; a matrix stays as it is.
         edges = _links.number_edges(value, names, "graph")
-        graph = Graph.construct(_links.from_either(edges, n_agents, "graph"))
+        # Checked here, so that the graph is made without another check: a sparse matrix, (A, A).
+        links = _links.from_matrix_or_edges(edges, n_agents, "graph")
+        graph = Graph.construct(links)
     else:
         raise InvalidArgumentError(
             "graph must be a Graph, a networkx graph, a matrix of zeros and ones, or "
@@ -533,7 +538,7 @@ def complete(agents: PositiveInt) -> Graph:
 
 @validated
 def disk(
-    positions: Annotated[ArrayInput, "A p", Bounds(at_least=-1e150, at_most=1e150)],
+    positions: Annotated[ArrayInput, "A p", _FINITE_SQUARE],
     radius: PositiveFloat,
 ) -> Graph:
     """Return the disk graph: links between agents within a distance, as radios of one range have.

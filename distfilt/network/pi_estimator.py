@@ -25,6 +25,7 @@ from .weights import UnstableGain, _laplacian_weights
 __all__ = ["PIState", "pi_start", "pi_step", "stable_substeps"]
 
 _Gain = Annotated[float, Bounds(at_least=0, at_most=1e100)]
+"""A gain, in 1/s; bounded, so that its square times that of an eigenvalue is finite."""
 
 
 @dataclass(frozen=True, eq=False)

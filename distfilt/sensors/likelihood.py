@@ -248,6 +248,7 @@ class LikelihoodSensor(Sensor):
                 f"log_likelihood must return logarithms, got numbers from {least:g} to "
                 f"{largest:g}, as likelihoods are: take np.log of them",
                 RuntimeWarning,
+                # The warning points at the call of evaluate(), above it and its validation.
                 stacklevel=4,
             )
 

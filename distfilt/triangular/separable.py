@@ -171,10 +171,12 @@ class SeparableMap:
         """Return the log-determinant of the map's derivative in x at each member, (..., N)."""
         joint = self._standardise(y, x)
         m = self.n_observed
-        # The derivative is triangular: the sum of log(dS_k / dx_k), with dv_k / dx_k = 1 / std.
+        # The derivative is triangular: the sum of log(dS_k / dx_k) = log(dS_k / dv_k) - log std_k
+        # for the standardised variables v_k = (x_k - centre_k) / std_k.
         log_scale = np.log(self.std[..., m:]).sum(axis=-1)
         total = -log_scale[..., None]
         for k in range(self.dim):
+            # Only the increasing part of S_k depends on v_k; its `rate` is dS_k / dv_k, (..., N).
             _value, rate = self._increasing_part(joint[..., m + k], k)
             total = total + np.log(rate)
         return np.asarray(total)

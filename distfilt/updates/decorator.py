@@ -341,6 +341,9 @@ def _stream(
     An ensemble's draws must not depend on which components other ensembles miss. So there is one
     stream for each number m of components, and each stream is drawn for all rows of the batch
     (*lead), of which a :class:`RowGenerator` returns those that are asked for.
+
+    The `seed` is what :func:`_draw_seed` has drawn from `rng`, which says here only whether it
+    belongs to some rows of a larger batch.
     """
     # The number of components is part of the seed.
     words = np.array([*seed, m], dtype=np.uint32)

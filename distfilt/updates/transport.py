@@ -32,6 +32,7 @@ __all__ = [
 ]
 
 Factor = Annotated[float, Bounds(at_least=0, at_most=1e100)]
+"""A factor of noise; bounded, so that their product is finite."""
 Fit = Callable[[Array, Array], ConditionalMap]
 """``fit(y, x) -> map``: an estimator of the map that takes the samples to the reference."""
 

@@ -193,19 +193,20 @@ def validated(
     ValueError: factor must be positive, got -1.0
     """
     constraints = SignatureConstraints(function, annotations)
-    # The function that is called with checked arguments, unless the library itself calls
-    outermost = function if call is None else call
+    # The function that a user's call reaches, with checked arguments
+    call_checked = function if call is None else call
 
     @wraps(function)
     def wrapper(*args: object, **options: object) -> object:
-        # Arguments of a nested call come from the library. `_NESTED` holds for this thread and
-        # task only, and the token restores what it was.
+        # Within a validated function the library calls, whose arguments need no check. `_NESTED`
+        # holds for this thread and task only, and the token restores what it was.
         if _NESTED.get():
             return function(*args, **options)
         arguments = constraints.validate(args, options)
         token = _NESTED.set(True)
         try:
-            return outermost(**arguments)
+            # The function itself, or `call` in its place
+            return call_checked(**arguments)
         finally:
             _NESTED.reset(token)
 
