@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from distfilt.filters import GaussianFilter, InformationConsensusFilter
+from distfilt.models import Model
 from distfilt.network import (
     Channel,
     Faults,
@@ -22,6 +23,7 @@ from distfilt.network import (
     push_sum,
     weights,
 )
+from distfilt.periods import wrap_differences
 from distfilt.sensors import Sensor, bearing, component
 from tests.filters.families import (
     PRIOR,
@@ -332,6 +334,46 @@ def test_angles_and_nonlinear_sensors(linearization: Any) -> None:
     other = g.step(g.start(prior), 1.0, seen)
     assert np.allclose(one.means, other.means, atol=1e-3)
     assert np.ptp(one.means, axis=0).max() < 1e-12
+
+
+@each_average
+@pytest.mark.parametrize("linearization", ["extended", "unscented"])
+def test_a_turn_of_everything_turns_the_estimates(
+    average: str, linearization: Any
+) -> None:
+    """The cut of an angle is nowhere: agents on both sides of it fuse as any others do."""
+    turn = 2 * np.pi
+    still = Model(
+        2, lambda x, t, dt: x, lambda t, dt: 0.01 * np.eye(2), periods={0: turn}
+    )
+    compass = component([0, 1], std=0.3, periods=(turn, None))
+    f = InformationConsensusFilter(
+        still,
+        [compass] * 6,
+        NET,
+        fusion=partial(average_consensus, rounds=2),
+        average=average,
+        linearization=linearization,
+    )
+    draw = rng(4)
+    headings = 0.2 * draw.standard_normal((6, 2))
+    observed = headings + 0.3 * draw.standard_normal((2, 6, 2))
+    cov = np.array([[0.04, 0.01], [0.01, 0.05]])
+
+    def run_turned(angle: float) -> Any:
+        by = np.array([angle, 0.0])
+        state = f.start([(m, cov) for m in headings + by])
+        for k, y in enumerate(observed + by, start=1):
+            wrapped = wrap_differences(y, still.periods)
+            state = f.step(state, float(k), list(wrapped))
+        return state
+
+    reference = run_turned(0.0)
+    for angle in np.linspace(0.5, turn, 7):
+        state = run_turned(angle)
+        change = state.means - reference.means - [angle, 0.0]
+        assert np.allclose(wrap_differences(change, still.periods), 0.0, atol=1e-9)
+        assert np.allclose(state.covariances, reference.covariances, atol=1e-12)
 
 
 def test_runs_of_a_batch_lose_their_own_messages() -> None:

@@ -246,6 +246,50 @@ def test_a_gated_reading_is_no_news() -> None:
         refusing.step(start, 1.0, y)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_in_any_order_of_senders_all_end_with_all_observations(seed: int) -> None:
+    """What waits is neither lost nor sent twice while the others' increments arrive."""
+    rng = default_rng(seed)
+    agents, d = 4, 2
+    speakers = [int(a) for a in rng.integers(agents, size=6)]
+    # In the end everybody speaks once more, when there is nothing new to see.
+    speakers += list(range(agents))
+    readings = rng.standard_normal((len(speakers), agents))
+    readings[rng.random(readings.shape) < 0.3] = np.nan
+    readings[-agents:] = np.nan
+
+    def links(t: float) -> graphs.Graph:
+        """All hear the only one that speaks in a step."""
+        speaker = speakers[round(t) - 1]
+        pairs = [(a, speaker) for a in range(agents) if a != speaker]
+        return graphs.Graph.from_edges(agents, pairs, directed=True)
+
+    rows = rng.standard_normal((agents, 1, d))
+    sensors = [
+        Sensor(1, lambda x, h=h: x @ h.T, [[0.4]], linear=lambda d, h=h: h)
+        for h in rows
+    ]
+    f = InformationIncrementFilter(still_model(d), sensors, links, target_dim=d)
+    prior = GaussianMixture.gaussian([0.5, -0.3], TARGET_COV)
+    state = f.start([prior] * agents)
+    for k, y in enumerate(readings, start=1):
+        seen = [None if np.isnan(one) else [one] for one in y]
+        state = f.step(state, float(k), seen)
+    exact = kalman_filter(
+        prior.mean,
+        prior.cov,
+        readings,
+        F=np.eye(d),
+        H=rows[:, 0],
+        Q=np.zeros((d, d)),
+        R=0.4 * np.eye(agents),
+    )
+    assert not any(state.unsent)
+    for belief in state.mixtures:
+        assert np.allclose(belief.mean, exact.means[-1], rtol=0, atol=1e-9)
+        assert np.allclose(belief.cov, exact.covariances[-1], rtol=0, atol=1e-9)
+
+
 def test_everybody_hears_only_neighbours() -> None:
     f = InformationIncrementFilter(
         MODEL, [EYE] * 3, graphs.path(3), target_dim=2, shared_components=[1]

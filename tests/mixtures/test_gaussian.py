@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from distfilt.mixtures import GaussianMixture, jeffreys_by_sampling, jeffreys_of_many
+from distfilt.mixtures import (
+    Divergence,
+    GaussianMixture,
+    jeffreys_by_sampling,
+    jeffreys_of_many,
+)
 from distfilt.mixtures.reduction import gaussian_divergences
 
 from .examples import random_frame, random_mixture, shuffle, transform
@@ -189,6 +196,46 @@ def test_quadrature_equals_the_closed_form(dim: int) -> None:
     assert divergences[0].error == 0
     # The second density is p itself.
     assert abs(divergences[1].value) < 1e-12
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_standard_error_of_sampling_is_symmetric_and_the_jackknife_s(
+    seed: int,
+) -> None:
+    """It is one divergence in both directions."""
+    p = random_mixture(2, 2, seed + 10, 1.0)
+    q = random_mixture(3, 2, seed + 20, 1.0)
+    # Half from each: no weight is above two.
+    proposal = GaussianMixture(
+        0.5 * np.concatenate([p.weights, q.weights]),
+        np.concatenate([p.means, q.means]),
+        np.concatenate([p.covs, q.covs]),
+    )
+    members = 400
+
+    def sample(
+        log_p: Callable[[np.ndarray], np.ndarray],
+        log_q: Callable[[np.ndarray], np.ndarray],
+    ) -> Divergence:
+        rng = np.random.default_rng(seed)
+        return jeffreys_by_sampling(log_p, log_q, proposal, members=members, rng=rng)
+
+    one = sample(p.log_density, q.log_density)
+    other = sample(q.log_density, p.log_density)
+    assert np.isclose(one.value, other.value, rtol=1e-9)
+    assert np.isclose(one.error, other.error, rtol=1e-9)
+    # The same draws, each left out in turn
+    x = proposal.rvs(members, rng=np.random.default_rng(seed))
+    log_ratio = p.log_density(x) - q.log_density(x)
+    means = []
+    for density in (p, q):
+        w = np.exp(density.log_density(x) - proposal.log_density(x))
+        left = (w @ log_ratio - w * log_ratio) / (w.sum() - w)
+        means.append(left)
+    without_one = 0.5 * (means[0] - means[1])
+    jackknife = np.sqrt((members - 1) * without_one.var())
+    # They differ by the order of one part in N, a weight's share of the sum.
+    assert np.isclose(one.error, jackknife, rtol=10 / members)
 
 
 def test_sampling_equals_the_closed_form_within_its_standard_error() -> None:
