@@ -336,6 +336,26 @@ def test_a_frozen_owner_stays_unchanged_by_the_checks_of_its_function() -> None:
     assert key not in first_use._CHECKED
 
 
+def test_equal_states_are_compared_once() -> None:
+    """Agents that share everything have equal states; different ones are compared all the same."""
+    n_calls = []
+
+    def mean_of_batch(x: np.ndarray) -> np.ndarray:
+        n_calls.append(len(x))
+        # Right for one state and for equal ones, wrong for others.
+        return np.broadcast_to(x.reshape(-1, 2).mean(axis=0), x.shape)
+
+    motion = Motion(mean_of_batch)
+    # Equal components pass by chance, so they prove nothing.
+    call_batched(motion, "step", [np.ones((3, 2))])
+    for _ in range(4):
+        call_batched(motion, "step", [np.tile([1.0, 2.0], (3, 1))])
+    # Three calls of each comparison, one of each later call
+    assert len(n_calls) == 2 * 3 + 3
+    with pytest.raises(ValueError, match="step must take many states at once"):
+        call_batched(motion, "step", [np.array([[1.0, 2.0], [3.0, 4.0]])])
+
+
 def test_a_user_s_function_in_a_batched_call_gets_its_own_checks() -> None:
     @validation.validated
     def scale(x: validation.Array, by: validation.PositiveFloat) -> Any:

@@ -115,8 +115,8 @@ class Filter(FrozenModel, ABC, Generic[S]):
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        # A new summary may be written for single states only.
-        # Such a subclass says itself if its summary accepts several states.
+        # The `summarize` of a subclass may be written for single states only, unless the subclass
+        # sets the flag too.
         if "summarize" in vars(cls) and "batched_summary" not in vars(cls):
             cls.batched_summary = False
 
@@ -133,7 +133,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
             raise ValueError(
                 f"names must have {n} different names, got {list(self.names)}"
             )
-        # A rule of the library says which kind of belief it fuses; others are not asked.
+        # A rule of the library is tagged with the kind of belief that it fuses; a user's has none.
         kind = kind_of_rule(self.fusion) if callable(self.fusion) else None
         if kind is not None and kind != self.belief_kind:
             raise ValueError(
@@ -196,7 +196,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         """Whether a multiple of the interval lies after `t_before` and not after `t`."""
         if self.exchange_interval is None:
             return True
-        # To rounding: a sum of steps may fall short of the multiple.
+        # To rounding, in units of the interval: a sum of steps may fall short of the multiple.
         tolerance = 1e-9 + 1e-15 * abs(t / self.exchange_interval)
         number = math.floor(t / self.exchange_interval + tolerance)
         return number > math.floor(t_before / self.exchange_interval + tolerance)
@@ -291,14 +291,15 @@ class Filter(FrozenModel, ABC, Generic[S]):
             )
         if runs and min(runs) < 1:
             raise ValueError(f"runs must be sizes of at least 1, got {runs!r}")
+        # A time in milliseconds or nanoseconds is probably a mistake.
         warn_of_unit(t, "t")
         fields = self.initial_state(prior, runs, rng)
-        # The steps have a stream of their own, whatever else the user draws from `rng`.
+        # The steps have a stream of their own, a child of `rng`, whatever else the user draws.
         child = None
         if self.requires_rng and rng is not None:
             (child,) = rng.spawn(1)
         ledger = Ledger.empty(self.n_agents)
-        # The class is the family's own, whose fields these are.
+        # A cast, since the fields are those of the family's class, and not known here.
         make = cast(Callable[..., S], self.state_class)
         return make(t, ledger, child, **fields)
 
@@ -340,6 +341,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         if t < state.t:
             Bounds(at_least=state.t)(t, "t")
         if state.t == 0:
+            # From 0 to the seconds of a clock since 1970 would be a single step of decades.
             warn_of_clock(0.0, np.array([t]), "t")
         return self._advance(state, t, observations, delayed, is_single=True)
 
@@ -354,7 +356,20 @@ class Filter(FrozenModel, ABC, Generic[S]):
         is_single: bool = False,
         are_read: bool = False,
     ) -> S:
-        """Take one step from checked arguments; a single one is not part of a planned run."""
+        """Take one step from checked arguments.
+
+        Parameters
+        ----------
+        state, t, observations, delayed
+            As for :meth:`step`.
+        reuse_rng : bool
+            Whether the step may draw from the state's own generator, or needs a copy, since the
+            state is the user's.
+        is_single : bool
+            Whether the step is not part of a run, whose plan has looked for copies and degrees.
+        are_read : bool
+            Whether each agent has a list of Observations that have been checked.
+        """
         read: Any = observations
         if not are_read:
             # `failed` of a SensorState has one entry for each run.
@@ -363,10 +378,11 @@ class Filter(FrozenModel, ABC, Generic[S]):
         sensor_filter = cast("SensorFilter[S]", self) if self.has_sensors else None
         matched: Sequence[Observation] = ()
         if delayed:
-            moved = insert_times(self, delayed, state, t, reuse_rng=reuse_rng)
+            # Beliefs about the times of delayed observations between two kept ones
+            extended = insert_times(self, delayed, state, t, reuse_rng=reuse_rng)
             # The generator of a state that was made here is not the user's.
-            reuse_rng = reuse_rng or moved is not state
-            state = moved
+            reuse_rng = reuse_rng or extended is not state
+            state = extended
             if sensor_filter is not None:
                 matched = match_delayed(sensor_filter, delayed, state, t)
         repeated: list[Observation] = []
@@ -381,7 +397,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         if repeated:
             step.warn_once("repeated", _describe_repetition(repeated[0]))
         if sensor_filter is not None and (is_single or matched):
-            # The plan of a run has looked at all others.
+            # Of a run the delayed ones only: its plan has looked at all others.
             parts = [*read, matched] if is_single else [matched]
             self._warn_of_unplanned(step, [o for part in parts for o in part])
         try:
@@ -396,7 +412,7 @@ class Filter(FrozenModel, ABC, Generic[S]):
         self, step: Step[S], observations: Sequence[Observation]
     ) -> None:
         """Warn once of angles in degrees and of copies, in observations outside a plan."""
-        # Angles below four turns need no closer look.
+        # Angles of less than four turns, 8π = 25 rad, need no closer look.
         large = [o for o in observations if (abs(o.value) > 25).any()]
         if large:
             sensors: Sequence[Sequence[Sensor]] = getattr(self, "agent_sensors", ())
@@ -404,7 +420,8 @@ class Filter(FrozenModel, ABC, Generic[S]):
             if text is not None:
                 step.warn_once("degrees", text)
         assimilated = step.state.assimilated
-        # Times differ by rounding: to milliseconds, or in single precision.
+        # The times of a copy differ by rounding: to milliseconds, or in single precision, which has
+        # seven digits.
         is_near = step.dt < max(1e-3, 1e-6 * abs(step.t))
         if assimilated and (is_near or step.delayed):
             text = find_rounded_copy(observations, assimilated, step.model.dim)
@@ -432,21 +449,34 @@ class Filter(FrozenModel, ABC, Generic[S]):
     ) -> Iterator[S]:
         """Yield the states at `times`, one after the other; arguments as in :meth:`run`."""
         self.check_state(state)
-        grid, entries = plan_steps(self, state, times, observations)
-        return self._iterate(state, grid, entries, delayed, reuse_rng=False)
+        # The times of the steps, and an iterator over the observations of each
+        step_times, entries = plan_steps(self, state, times, observations)
+        # The user gets each state, so that no step may change the generator of the one before.
+        return self._iterate(state, step_times, entries, delayed, reuse_rng=False)
 
     def _iterate(
         self,
         state: S,
-        grid: Array,
+        step_times: Array,
         entries: Iterable[StepObservations],
         delayed: Sequence[Observation],
         *,
         reuse_rng: bool,
     ) -> Iterator[S]:
-        """Yield the states of a run, each delayed observation at the time when it has arrived."""
+        """Yield the states of a run; delayed observations are assimilated when they have arrived.
+
+        Parameters
+        ----------
+        state : State
+            The user's state before the run.
+        step_times, entries : ndarray, (T,), and iterable
+            The times of the steps, and the observations of each.
+        delayed : sequence of Observation
+        reuse_rng : bool
+            Whether all states share one generator; otherwise each step copies it.
+        """
         # An observation that arrives after the last step would be lost without a word.
-        last = grid[-1] if grid.size else -np.inf
+        last = step_times[-1] if step_times.size else -np.inf
         for observation in delayed:
             arrival = observation.arrival_time
             if arrival is None or arrival > last:
@@ -456,12 +486,14 @@ class Filter(FrozenModel, ABC, Generic[S]):
                 )
         # In order of arrival; those with the same arrival keep the user's order.
         waiting = sorted(delayed, key=_arrival_time)
+        # Whether the state's generator is the run's own, which a step may use without a copy
         is_own = False
-        for t, (observed, are_read) in zip(grid.tolist(), entries, strict=True):
+        for t, (observed, are_read) in zip(step_times.tolist(), entries, strict=True):
             arrived: list[Observation] = []
             while waiting and _arrival_time(waiting[0]) <= t:
                 arrived.append(waiting.pop(0))
-            # The generator runs after the validated call that made it has returned.
+            # This generator function runs after the validated call that made it has returned, so
+            # that the steps inside it have to skip the validation again.
             with skip_validation():
                 state = self._advance(
                     state,
@@ -553,11 +585,12 @@ class Filter(FrozenModel, ABC, Generic[S]):
     ) -> xarray.Dataset:
         """Record a run: of each time the belief when `lag` more have been observed."""
         self.check_state(state)
-        grid, entries = plan_steps(self, state, times, observations)
-        states = self._iterate(state, grid, entries, delayed, reuse_rng=True)
-        # Without a lag every state is its own smoothed one.
+        # The times of the steps, and an iterator over the observations of each
+        step_times, entries = plan_steps(self, state, times, observations)
+        states = self._iterate(state, step_times, entries, delayed, reuse_rng=True)
+        # Pairs of a state and the later belief about its time; without a lag the state itself
         smoothed = _smooth_states(states, lag)
-        return record_run(self, grid, state, smoothed, recording)
+        return record_run(self, step_times, state, smoothed, recording)
 
 
 @dataclass(frozen=True, eq=False)
@@ -618,6 +651,7 @@ class SensorFilter(Filter[S]):
         """Refuse sensors or a graph that this family cannot use."""
         super().check_parts()
         self._check_agent_models()
+        # A sensor of changes compares with the state at its last observation.
         if not self.supports_increments and self.change_sources:
             raise ValueError(
                 "sensors must not be increments here: this filter keeps no previous state"
@@ -632,9 +666,10 @@ class SensorFilter(Filter[S]):
                     f"graph must be a Graph of {self.n_agents} agents, got None"
                 )
         elif not callable(self.graph):
-            # A fixed graph is converted once.
+            # A fixed graph is converted once. The dataclass is frozen, so the field is set past it.
             graph = as_graph(self.graph, self.n_agents, self.names)
             object.__setattr__(self, "graph", graph)
+        # Between two exchanges observations wait.
         if self.exchange_interval is not None and self.sends_observations:
             self._check_waiting()
 
@@ -668,6 +703,7 @@ class SensorFilter(Filter[S]):
                 "LikelihoodSensor: use ParticleFilter, TransportFilter, GridFilter or "
                 "LikelihoodConsensusFilter"
             )
+        # The gate compares an observation with the mean and covariance of its prediction.
         if self.gate_probability is not None and sensor.moments is None:
             raise ValueError(
                 "sensors must be LikelihoodSensors with moments for a gate, got moments of None"
@@ -675,6 +711,7 @@ class SensorFilter(Filter[S]):
 
     def _check_waiting(self) -> None:
         """Refuse a filter whose observations wait for an exchange and cannot be used then."""
+        # An observation that has waited is assimilated at its own time, as a delayed one.
         if not self.lag:
             raise ValueError(
                 "lag must be at least 1 for observations that wait for an exchange, got 0"
@@ -698,7 +735,7 @@ class SensorFilter(Filter[S]):
 
     @cached_property
     def notices_wrapping(self) -> bool:
-        """Whether a transition that wraps is looked for; a matrix cannot wrap."""
+        """Whether the steps look for a transition that wraps angles; a linear one cannot."""
         return self.lacks_periods and not isinstance(self.model, LinearModel)
 
     @cached_property
@@ -722,7 +759,7 @@ class SensorFilter(Filter[S]):
 
     @cached_property
     def change_sources(self) -> tuple[tuple[int, int], ...]:
-        """The agents and numbers of all sensors of changes."""
+        """All sensors of changes, as pairs of an agent and the number of its sensor."""
         sources = []
         for agent, sensors in enumerate(self.agent_sensors):
             for number, sensor in enumerate(sensors):
@@ -815,7 +852,8 @@ class SensorFilter(Filter[S]):
         names, _ = self.components
         reset = read_reset(components, value, cov, agents, names, self.n_agents)
         if state.rejection_streaks is not None:
-            # What the former belief rejected says nothing about the new one.
+            # The former belief's rejections do not count for the new one. The counts have the axes
+            # (*runs, A, source, sensor).
             streaks = state.rejection_streaks.copy()
             streaks[..., reset.agents, :, :] = 0.0
             state = state.replace(rejection_streaks=streaks)
@@ -851,6 +889,8 @@ class SensorFilter(Filter[S]):
         self, observations: object, runs: tuple[int, ...], t: float
     ) -> list[list[Observation]]:
         """Check the observations of one time, and return a list of them for each agent."""
+        # The number of components that each agent observes; None for an agent without a sensor or
+        # with several, which no shape of an array fits.
         sizes = self.observation_sizes
         if type(observations) is not list or len(observations) != len(sizes):
             return read_observations(self, observations, runs, t)
@@ -867,6 +907,7 @@ class SensorFilter(Filter[S]):
                         return read_observations(self, observations, runs, t)
                 result.append(entry.copy())
                 continue
+            # Anything else, or a missing number, takes the general way, which checks and completes.
             if (
                 type(entry) is not np.ndarray
                 or entry.dtype != _FLOAT64
@@ -880,7 +921,10 @@ class SensorFilter(Filter[S]):
     def _fits(
         self, observation: object, agent: int, runs: tuple[int, ...], t: float
     ) -> bool:
-        """Whether an event is a complete observation of this time by a sensor of the agent."""
+        """Whether an Observation is complete, of this time, and by a sensor of the agent.
+
+        A sensor that comes with it is checked elsewhere.
+        """
         if type(observation) is not Observation:
             return False
         number = observation.sensor
@@ -889,6 +933,7 @@ class SensorFilter(Filter[S]):
             return False
         if observation.agent != agent or observation.t != t:
             return False
+        # One that arrives later must come as a delayed one.
         if observation.arrival_time is not None and observation.arrival_time > t:
             return False
         value = observation.value
@@ -916,11 +961,15 @@ def _describe_repetition(observation: Observation) -> str:
 
 
 def _arrival_time(observation: Observation) -> float:
+    """Return when an observation arrives; one without a time has always been there."""
     return -np.inf if observation.arrival_time is None else observation.arrival_time
 
 
 def _smooth_states(states: Iterable[S], lag: int) -> Iterator[tuple[S, S]]:
-    """Yield each state, and the belief about its time when `lag` more have been observed."""
+    """Yield each state, and the belief about its time when `lag` more have been observed.
+
+    A state's `lagged_states` are its beliefs about the `lag` times before it, oldest first.
+    """
     if not lag:
         for state in states:
             yield state, state
@@ -929,13 +978,15 @@ def _smooth_states(states: Iterable[S], lag: int) -> Iterator[tuple[S, S]]:
     for state in states:
         recent.append(state)
         steps = [one.t for one in recent]
+        # A time between two steps would shift the others among the lagged states.
         if any(time not in steps for time in state.times if time > steps[0]):
             raise ValueError(
                 "delayed must be of one of the times for smoothing, got one between two of them"
             )
         if len(recent) > lag:
+            # The oldest of these, and the last state's belief about its time, `lag` steps back
             yield recent.pop(0), state.lagged_states[-lag]
-    # Near the end fewer times follow.
+    # The last states have fewer times after them: the final state's beliefs serve for all.
     if recent:
         beliefs = [*recent[-1].lagged_states, recent[-1]]
         yield from zip(recent, beliefs[-len(recent) :], strict=True)

@@ -63,17 +63,20 @@ def bridge_states(
     (array([0.5]), array([0.5]))
     """
     start, t, end = times
+    # f(x₀), F₁ at x₀, F₂ at f(x₀), and Q₁; finite differences take their steps from `std`.
     forecast = model.step(before, start, t - start)
     slope_before = model.jacobian(before, start, t - start, std=std)
     slope_after = model.jacobian(forecast, t, end - t, std=std)
     first = model.noise_at(before, start, t - start)
+    # F₂ Q₁, and S = F₂ Q₁ F₂ᵀ + Q₂. Scaled to unit variances, S has no units, and so has the
+    # threshold below which eigenvalues count as zero.
     cross = slope_after @ first
-    # The pseudo-inverse has no units if the variances are one.
     scaled, unit = to_unit_variances(
         symmetrise(cross @ slope_after.mT + model.noise_at(forecast, t, end - t))
     )
     inverse = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True)
     inverse = inverse / (unit[..., :, None] * unit[..., None, :])
+    # G = Q₁ F₂ᵀ S⁺, and the covariance Q₁ - G F₂ Q₁
     gain = cross.mT @ inverse
     after = model.step(forecast, t, end - t)
     cov = symmetrise(first - gain @ cross)
@@ -92,9 +95,10 @@ def draw_bridge(
 
     `normal` holds standard normal draws that broadcast to the states.
     """
+    # The members' standard deviations, as the scale of finite differences
     spread = before.std(axis=-2, keepdims=True)
     law = bridge_states(model, before, times, np.broadcast_to(spread, before.shape))
-    # e = V √λ z, whatever the rank of its covariance
+    # e = V √λ z with the covariance V diag(λ) Vᵀ, whatever its rank
     values, vectors = np.linalg.eigh(law.cov)
     scaled = np.sqrt(np.maximum(values, 0.0)) * normal
     noise = (vectors @ scaled[..., None])[..., 0]
@@ -112,15 +116,18 @@ def insert_times(
 ) -> AnyState:
     """Return the state with beliefs about the times of delayed observations that it does not keep.
 
-    A time within the step that is taken is inserted behind its forecast, so that the state
-    returned is that at `t` then.
+    A time within the step to `t` lies between two kept times only after the forecast to `t`. So the
+    forecast is made here, and the state returned is that at `t`.
     """
     if not f.lag:
         return state
+    # The oldest first
     for t_obs in sorted({observation.t for observation in delayed}):
+        # Within the present step, and not at one of its ends: then the state is forecast to `t`.
         if t_obs > state.t and not _is_kept(t_obs, (state.t, t), t):
             state = _forecast(f, state, t, t_obs, reuse_rng=reuse_rng)
         times = (*state.times, state.t)
+        # A kept time needs no insertion; one before all of them is refused later.
         if _is_kept(t_obs, times, t) or not times[0] < t_obs < times[-1]:
             continue
         state = f.insert_time(state, t_obs)
@@ -130,7 +137,8 @@ def insert_times(
 def _is_kept(t_obs: float, times: Sequence[float], t: float) -> bool:
     """Whether a time is one of these to rounding.
 
-    A sum of steps may differ by rounding, but by far less than the shortest of them.
+    A sum of steps may differ by rounding, but by far less than the shortest of them. `t` is the
+    time of the present step.
     """
     shortest = min((b - a for a, b in pairwise((*times, t)) if b > a), default=0.0)
     tolerance = min(1e-9 * max(1.0, abs(t_obs)), 1e-3 * shortest)
@@ -150,7 +158,7 @@ def _forecast(
     It is the forecast alone: the step itself, which follows with a length of zero, has the exchange
     and the observations.
     """
-    # From the end of the step on there is no place between two times.
+    # A time at the end of the step or later is not between two of its times.
     if t_obs >= t:
         return state
     if f.exchange_interval is not None:
@@ -168,10 +176,11 @@ def _forecast(
 class Gap(NamedTuple):
     """The gap between two kept times in which another one lies.
 
-    `place` is the number of kept times before it; `start` and `end` are those on both of its sides.
+    `n_before` is the number of kept times before it, which is also the index of the next one;
+    `start` and `end` are the times on both of its sides.
     """
 
-    place: int
+    n_before: int
     start: float
     end: float
 
@@ -179,8 +188,8 @@ class Gap(NamedTuple):
 def find_gap(state: State, t_obs: float) -> Gap:
     """Return the gap between a state's kept times in which `t_obs` lies."""
     times = (*state.times, state.t)
-    place = sum(time < t_obs for time in times)
-    return Gap(place, start=times[place - 1], end=times[place])
+    n_before = sum(time < t_obs for time in times)
+    return Gap(n_before, start=times[n_before - 1], end=times[n_before])
 
 
 def insert_gaussian(
@@ -188,14 +197,16 @@ def insert_gaussian(
 ) -> GaussianState:
     """Return a Gaussian state with the belief about a time between two that it keeps."""
     gap = find_gap(state, t_obs)
-    place = gap.place
+    n_before = gap.n_before
     d = state.dim
-    n = len(state.history) + 1
+    n_times = len(state.history) + 1
     mean = state.joint_means
     cov = state.joint_covariances
-    # The latest time is the first block.
-    after = slice((n - 1 - place) * d, (n - place) * d)
-    before = slice((n - place) * d, (n - place + 1) * d)
+    # The joint state has the latest time in its first block of d components: the time after the
+    # gap is followed by the one before it.
+    n_after = n_times - n_before
+    after = slice((n_after - 1) * d, n_after * d)
+    before = slice(n_after * d, (n_after + 1) * d)
     std = deviations(cov[..., before, before])
     model = f.model_of_states(state.runs)
     times_of_law = (gap.start, t_obs, gap.end)
@@ -203,13 +214,15 @@ def insert_gaussian(
     # Given the state before, x(τ) is `forecast` and the state after is `law.after`, on average.
     innovation = wrap_differences(mean[..., after] - law.after, f.periods)
     new_mean = law.forecast + (law.gain @ innovation[..., None])[..., 0]
-    # x(τ) = F₁ x₀ + G (x₁ - F₂ F₁ x₀) + e, for x₀ before and x₁ after
+    # x(τ) = F₁ x₀ + G (x₁ - F₂ F₁ x₀) + e, for x₀ before and x₁ after: the rows are the matrix of
+    # x(τ) in terms of the joint state.
     rows = np.zeros((*mean.shape[:-1], d, mean.shape[-1]))
     rows[..., after] = law.gain
     rows[..., before] = (np.eye(d) - law.gain @ law.slope_after) @ law.slope_before
+    # Covariance of x(τ) with the joint state, and its own
     cross = rows @ cov
     variance = cross @ rows.mT + law.cov
-    # The new block stands between the two.
+    # The new block is inserted between the two.
     cut = after.stop
     cov = np.block(
         [
@@ -219,7 +232,8 @@ def insert_gaussian(
         ]
     )
     mean = np.concatenate([mean[..., :cut], new_mean, mean[..., cut:]], axis=-1)
-    times = (*state.times[:place], t_obs, *state.times[place:])[-f.lag :]
+    # Of the earlier times the latest ones that the lag keeps, and their blocks after the present
+    times = (*state.times[:n_before], t_obs, *state.times[n_before:])[-f.lag :]
     size = (len(times) + 1) * d
     return state.replace(
         joint_means=mean[..., :size],
@@ -231,22 +245,28 @@ def insert_gaussian(
 def insert_members(
     f: MembersFilter[MemberState], state: MemberState, t_obs: float
 ) -> MemberState:
-    """Return a state of members with those of a time between two that it keeps."""
+    """Return a state of members with draws of those at a time between two that it keeps.
+
+    Each is drawn given the same member's states at the times before and after.
+    """
     from .base import require_rng
     from .step import copy_rng
 
     gap = find_gap(state, t_obs)
+    # The members of the kept times, oldest first, and the present ones
     beliefs = [*[belief for _time, belief in state.past], state.belief]
     # Steps of members draw, so that their states have a generator.
     rng = copy_rng(require_rng(state.rng))
     drawn = draw_bridge(
         f.model_of_states(state.runs),
-        beliefs[gap.place - 1],
-        beliefs[gap.place],
+        # The times before and after `t_obs`
+        beliefs[gap.n_before - 1],
+        beliefs[gap.n_before],
         (gap.start, t_obs, gap.end),
         f.draw_normal(state.belief.shape, rng),
         f.periods,
     )
     history = list(state.past)
-    history.insert(gap.place, (t_obs, drawn))
+    history.insert(gap.n_before, (t_obs, drawn))
+    # The latest times that the lag keeps
     return state.replace(history=tuple(history[-f.lag :]), rng=rng)

@@ -35,7 +35,7 @@ class Previous(NamedTuple):
 
     members: Array
     """The states, (*runs, G, N, d)."""
-    cells: Mask
+    is_compared: Mask
     """Which numbers of a group, (G, M) or (*runs, G, M)."""
 
 
@@ -82,22 +82,26 @@ class References:
         for of_agent in observations:
             for observation in of_agent:
                 self._add(observation)
+        # The earlier times that sensors compare with after the step, and those in this step too
         self.kept = _list_times(self.after.values()) - {t}
         needed = (_list_times(self.last.values()) | self.kept) - {t}
         if state.t not in self.kept:
-            # The members with which the step begins serve without a copy.
+            # Of the state's own time no copy is needed: the members with which the step begins.
             needed -= {state.t}
+        # The times about which the state has beliefs. A step of no length keeps its past only.
         held = {time for time, _ in state.references}
         held |= {state.t, *state.times} if t > state.t else set(state.times)
         self.times = tuple(sorted(needed & held))
         self.sources: dict[int, list[tuple[Source | None, int]]] = {}
 
     def _add(self, observation: Observation) -> None:
-        """Note that a sensor observes now, in the runs and components that are not missing."""
+        """Note that a sensor of changes observes now, in the runs and components not missing."""
         number = observation.sensor
+        # A sensor that comes with its observation measures no change, nor do most others.
         if isinstance(number, Sensor) or (observation.agent, number) not in self.after:
             return
         source = observation.agent, number
+        # Where a number is missing, the time of the last one stays, (*runs, m).
         present = ~np.isnan(observation.value)
         if present.all():
             self.after[source] = self.t
@@ -105,7 +109,10 @@ class References:
             self.after[source] = np.where(present, self.t, self.after[source])
 
     def receive(self, agent: int, observation: Observation) -> None:
-        """Note that an agent has a present observation, after those noted before."""
+        """Note that an agent has a present observation, after those noted before.
+
+        Its source is None if its sensor measures no change.
+        """
         number = observation.sensor
         source = None
         if not isinstance(number, Sensor) and (observation.agent, number) in self.last:
@@ -131,14 +138,16 @@ class References:
             The time and the members with which the step begins, if it has a length.
         """
         agents = group.agents.tolist()
-        rows = [self._times_of(agent) for agent in agents]
-        runs = np.broadcast_shapes(*[row.shape[:-1] for row in rows])
-        m = group.target.shape[-1]
-        cells = np.stack([np.broadcast_to(row, (*runs, m)) for row in rows], axis=-2)
+        # The time with which each number of the group is compared, (G, M) or (*runs, G, M)
+        of_agents = [self._times_of(agent) for agent in agents]
+        runs = np.broadcast_shapes(*[row.shape[:-1] for row in of_agents])
+        shape = (*runs, group.target.shape[-1])
+        compared = np.stack([np.broadcast_to(r, shape) for r in of_agents], axis=-2)
         result = []
+        # For each time the members about it: of the past, or those with which the step begins
         sources = [source for agent in agents for source, _ in self.sources[agent]]
-        compared = [self.last[source] for source in sources if source is not None]
-        for time in sorted(_list_times(compared)):
+        last_times = [self.last[source] for source in sources if source is not None]
+        for time in sorted(_list_times(last_times)):
             if time in times:
                 members = past[times.index(time)]
             elif origin is not None and time == origin[0]:
@@ -149,13 +158,17 @@ class References:
                     "a sensor of changes compares; there is none at t = "
                     f"{format_number(self.t)}"
                 )
-            result.append(Previous(members[..., group.rows, :, :], cells == time))
+            result.append(Previous(members[..., group.rows, :, :], compared == time))
         return result
 
     def _times_of(self, agent: int) -> Array:
-        """Return the times with which an agent's present numbers compare, NaN without one."""
+        """Return the times with which an agent's present numbers compare, NaN without one.
+
+        They are (M,), or (*runs, M) where they differ between runs.
+        """
         numbers: list[float] = []
         for source, size in self.sources[agent]:
+            # One time for the observation's numbers, or an array (*runs, size)
             time = np.nan if source is None else self.last[source]
             if isinstance(time, np.ndarray):
                 return self._times_by_run(agent)
@@ -163,12 +176,14 @@ class References:
         return np.array(numbers)
 
     def _times_by_run(self, agent: int) -> Array:
-        """Return what `_times_of` does where components or runs have times of their own."""
+        """Return the times of `_times_of` where components or runs have times of their own."""
+        # For each of the agent's observations its times, (size,) or (*runs, size)
         parts = []
         for source, size in self.sources[agent]:
             times = np.nan if source is None else self.last[source]
             shape = (*np.shape(times)[:-1], size)
             parts.append(np.broadcast_to(times, shape))
+        # All for the same runs, and one behind the other, (*runs, M)
         runs = np.broadcast_shapes(*[part.shape[:-1] for part in parts])
         parts = [np.broadcast_to(part, (*runs, part.shape[-1])) for part in parts]
         return np.concatenate(parts, axis=-1)

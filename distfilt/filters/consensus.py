@@ -113,18 +113,23 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
     ) -> dict[str, object]:
         """Return the prior for the agents; where all information is averaged, it is definite."""
         if self.average != "measurements":
+            # Raises an error if a covariance has no inverse.
             moments_by_agent(prior, self.model.dim, self.n_agents, "definite")
         return super().initial_state(prior, runs, rng)
 
     def next_state(self, step: Step[GaussianState]) -> GaussianState:
         """Forecast, average the information, add it."""
         means, covs = self._check_forecast(step)
-        # All agents' angles on one branch, so that vectors can be averaged.
+        # The agents' angles near each other, within half a period of their circular mean, so that
+        # vectors can be averaged
         branch = fold(means, self.periods)
+        # Information that each agent gains by its observations: matrix and vector, side by side,
+        # (*runs, A, d, d + 1)
         gained = np.zeros((*branch.shape, branch.shape[-1] + 1))
-        for _place, group in step.received():
+        for _time_index, group in step.received():
             self._add_information(gained, means, branch, covs, group, step)
-        # δΩ and δq of each agent's own observations
+        # δΩ and δq of each agent's own observations as one vector: the matrix is symmetric, so that
+        # d(d+3)/2 numbers are enough
         own = pack_information(gained[..., :-1], gained[..., -1])
         if not step.has_fusion:
             new = self._add_to_forecast(step, branch, covs, own)
@@ -152,6 +157,7 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
         numbers; Ω is that of its forecast.
         """
 
+        # `apply` also passes an array that all rows share and a generator, not needed here.
         def compute(m: Array, p: Array, *_: object) -> tuple[Array]:
             return (pack_information(*to_information(m, p)),)
 
@@ -169,7 +175,10 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
     def _find_gaussians(
         self, step: Step[GaussianState], means: Array, covs: Array, total: Array
     ) -> tuple[Array, ...]:
-        """Return the Gaussians that have this information."""
+        """Return the Gaussians that have this packed information (*runs, A, n).
+
+        An agent whose information matrix is not definite fails, and keeps the given moments.
+        """
         d = means.shape[-1]
 
         def compute(numbers: Array, *_: object) -> tuple[Array, Array]:
@@ -180,14 +189,18 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
     def _add_to_forecast(
         self, step: Step[GaussianState], means: Array, covs: Array, gained: Array
     ) -> tuple[Array, ...]:
-        """Return the Gaussians with information added; components may be known constants."""
+        """Return the Gaussians with packed information (*runs, A, n) added.
+
+        Components may be known constants, whose variance is zero: no covariance is inverted.
+        """
         d = means.shape[-1]
 
         def compute(
             m: Array, p: Array, numbers: Array, *_: object
         ) -> tuple[Array, Array]:
+            # The information matrix J and vector v that are added: P⁺ = (I + P J)⁻¹ P and
+            # m⁺ = m + P⁺ (v - J m).
             j, v = unpack_information(numbers, d)
-            # P⁺ = (I + P J)⁻¹ P and m⁺ = m + P⁺ (v - J m)
             new = symmetrise(np.asarray(np.linalg.solve(np.eye(d) + p @ j, p)))
             change = new @ (v[..., None] - j @ m[..., None])
             return m + change[..., 0], new
@@ -205,13 +218,18 @@ class InformationConsensusFilter(GaussianFamily, FusesBeliefs[GaussianState]):
         group: Received,
         step: Step[GaussianState],
     ) -> None:
-        """Write Hᵀ R⁻¹ [H, y - h(m) + H m] of a group's own observations, in place."""
+        """Write Hᵀ R⁻¹ [H, y - h(m) + H m] of a group's own observations into `gained`.
+
+        The mean m is that of `branch` in the linear term: `means` with angles shifted by whole
+        periods.
+        """
+        # The index of the group's agents in arrays (*runs, A, ...)
         rows = group.rows
         mean = means[..., rows, :]
         cov = covs[..., rows, :, :]
         result = self._innovate(mean, cov, group, step)
         missing = np.isnan(result.innovation)
-        # A missing component has a row of zeros, and a unit variance of its own.
+        # A missing number has a row of zeros in H, and row and column of the identity in R.
         slope = np.where(missing[..., None], 0.0, result.slope)
         innovation = np.where(missing, 0.0, result.innovation)
         noise = result.group.noise

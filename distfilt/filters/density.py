@@ -217,7 +217,7 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
         self, observations: object, runs: tuple[int, ...], t: float
     ) -> SwarmSnapshot:
         """Check the agents' positions (A, d); None and NaN are agents that have gone."""
-        # An agent that has gone has no position.
+        # An agent that has gone has a position of NaN.
         missing = np.full(self.model.grid.dim, np.nan)
         entries = list_by_agent(observations, self.n_agents)
         positions = [missing if entry is None else entry for entry in entries]
@@ -269,10 +269,14 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
         return SwarmSnapshot(x, self.model.grid, self.bandwidth, t, self.local)
 
     def _graph_at(self, snapshot: SwarmSnapshot, t_before: float, t: float) -> Graph:
-        """Return the communication graph of the present agents at the time of a step."""
+        """Return the graph of the present agents in a step from `t_before` to `t`.
+
+        It has no links if no exchange is due.
+        """
         if not self.is_exchange_time(t_before, t):
             return Graph.from_edges(self.n_agents, np.zeros((0, 2)))
         if isinstance(self.graph, float):
+            # The range of the agents' radios
             return snapshot.disk_graph(self.graph)
         graph = self.graph
         # A moving graph may depend on where the agents are.
@@ -296,6 +300,7 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
         [0 0 0 0]
         """
         state = step.state
+        # The agents' positions, and the kernels about them
         snapshot: SwarmSnapshot = step.observations
         t = step.t
         dt = step.dt
@@ -306,22 +311,26 @@ class DensityFilter(ExchangesAtIntervals[DensityState]):
         # The graph depends on the positions, so the channel is made here.
         graph = self._graph_at(snapshot, state.t, t)
         channel = Channel(graph, ledger=state.ledger, faults=self.faults, t=t)
-        # Agents move, drop out and wait for an exchange: the record has the number of parts.
+        # Agents move, drop out and wait for an exchange: a network in several parts is no reason
+        # for the channel's warning, since the record has their number.
         channel.expects_parts = True
         step.channel = channel
+        # The protocol's new memory, each agent's estimate of the kernel density, (A, n), and of how
+        # many agents' kernels it is made, (A,)
         memory, densities, counts = self.fusion.update(
             state.carried, snapshot, channel, dt
         )
         # The protocol runs at all agents, the filter at some of them.
         observed = densities[self.filtering]
 
-        # The forecast is one step of the Fokker-Planck equation.
+        # The forecast is one step of the Fokker-Planck equation. The factor of Q is in proportion
+        # to that of the prior covariance.
         solver = self.model.solver(state.t, dt)
         noise_factor = None
         if self.process is not None:
             noise_factor = self.process * self._prior_factor
         forecast = low_rank_predict(state.filters, solver, process=noise_factor, dt=dt)
-        # R = k̄ diag(density), equation (15).
+        # R = k̄ diag(density), equation (15), where k̄ follows from the kernels and their number.
         density = forecast.estimates if self.noise == "forecast" else observed
         noise = snapshot.noise_strength(density, snapshot.present.sum(), self.floor)
         filters = low_rank_step(forecast, observed, noise, dt)

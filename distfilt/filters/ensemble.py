@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property, partial
 from inspect import signature
-from typing import Annotated, ClassVar, Literal, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
 import numpy as np
 
@@ -148,10 +148,12 @@ class MembersFilter(
         dim = self.model.dim
         priors = split_by_agent(prior, dim, self.n_agents)
         if priors is not None:
+            # Without the last of the leading axes, that of the agents, which the stack adds
             drawn = [self.draw_prior(one, leading[:-1], rng) for one in priors]
             return np.stack(drawn, axis=-3)
         members = draw_members(prior, self.members, leading, dim, rng)
-        # A Gaussian runs on, however wide it is; other members may be cut at ±period/2.
+        # A prior (mean, cov) is drawn as a Gaussian on the line, whose angles are near each other.
+        # Other members may be wrapped, with some of them a period away from the rest.
         if type(prior) is tuple:
             return members
         return fold_torn(members, self.periods)
@@ -168,7 +170,7 @@ class _EnsembleSummary(MembersFilter[EnsembleState]):
         """Return means and variances of the agents' ensembles, and the members for the scores."""
         ensembles = state.ensembles
         mean, anomalies = center_ensemble(ensembles)
-        # Σ (xᵢ - m)² / (N - 1), as a mean of N times N / (N - 1).
+        # Σ (xᵢ - m)² / (N - 1), as the mean of N squares times N / (N - 1).
         anomalies *= anomalies
         variance = moments.mean(anomalies) * (self.members / (self.members - 1))
         return Summary(
@@ -229,6 +231,7 @@ class EnsembleFilter(
     def check_parts(self) -> None:
         """Refuse an update of another signature, such as a wrapper without its update."""
         super().check_parts()
+        # Whether it can be called with members, predictions, observation and noise
         try:
             signature(self.update).bind(*range(4), rng=None)
         except TypeError as error:
@@ -274,7 +277,7 @@ class EnsembleFilter(
         exact: dict[str, object] = {"update": enkf_exact, "forecast": exact_forecast}
         if graph is not None:
             exact["fusion"] = partial(intersect_ensembles, rule="min_determinant")
-        # The constructor checks the options.
+        # A cast, since the types of the options are not known here: the constructor checks them.
         make = cast(Callable[..., EnsembleFilter], cls)
         return make(model, sensors, graph, **(exact | options))
 
@@ -303,6 +306,7 @@ class EnsembleFilter(
     ) -> dict[str, object]:
         """Draw members for each agent."""
         members = self.draw_prior(prior, (*runs, self.n_agents), rng)
+        # Angles are shifted by whole periods: each agent's mean is then in [-period/2, period/2).
         return {"ensembles": settle(members, self.periods)}
 
     def next_state(self, step: Step[EnsembleState]) -> EnsembleState:
@@ -316,16 +320,18 @@ class EnsembleFilter(
             )
             _check_shape(ensembles, "forecast", state.ensembles.shape)
             if self.periods:
-                # A forecast of the user's own may wrap.
+                # A forecast of the user's own may wrap angles, so that some members lie a period
+                # away from the rest.
                 ensembles = fold_torn(ensembles, self.periods)
             if self.notices_wrapping:
                 warn_of_wrapping(
                     step.model, state.ensembles, ensembles, state.t, step.dt
                 )
-        # The ensembles of the earlier times that are kept, and now.
+        # The ensembles of the earlier times that are kept, oldest first, and the present ones last
         stack = step.stack(step.check_forecast(ensembles, state.ensembles))
-        for place, group in step.received():
-            self._condition(stack, place, group, step)
+        # Groups of agents that have equally many observations of one time of the stack
+        for time_index, group in step.received():
+            self._condition(stack, time_index, group, step)
         # Agents exchange beliefs after the update, through the same channel.
         fused = stack[-1]
         past = stack[:-1]
@@ -333,77 +339,124 @@ class EnsembleFilter(
             fused = fuse_members(step, fused)
             past = regress_past(stack, fused)
         if self.periods:
+            # Members are shifted alike by whole periods: their mean lies in [-period/2, period/2).
             fused = settle(fused, self.periods)
             past = [settle(x, self.periods) for x in past]
         return step.end(ensembles=fused, past=past)
 
     def _condition(
-        self, stack: list[Array], place: int, group: Received, step: Step[EnsembleState]
+        self,
+        stack: list[Array],
+        time_index: int,
+        group: Received,
+        step: Step[EnsembleState],
     ) -> None:
-        """Condition every time's ensembles of a group's agents on its observations, in place."""
+        """Condition every time's ensembles of a group's agents on its observations, in place.
+
+        The stack has the ensembles (*runs, A, N, d) of the times that are kept, the present one
+        last. The group's observations are of the time with the index `time_index` among these.
+        """
+        # The index of the group's agents in arrays (*runs, A, ...)
         rows = group.rows
         members = tuple([ensembles[..., rows, :, :] for ensembles in stack])
-        # A delayed observation of the previous time has changed it in the stack.
+        # A sensor of changes compares with earlier members. They come from the stack, since a
+        # delayed observation of that time may have changed them.
         previous = None
         if group.changes:
-            previous = step.before(place, group, stack[:-1])
-        # An update by likelihoods compares every member with the observation by itself.
+            previous = step.find_previous(time_index, group, stack[:-1])
+        # An update by likelihoods compares every member with the observation by itself: each
+        # predicted angle is brought near the observed one. Others need all predictions on one
+        # branch, whose mean is near it.
         weights_members = self._weights_members
         branch: Literal["mean", "each"] = "each" if weights_members else "mean"
-        predicted = group.predict(members[place], previous, branch=branch)
+        predicted = group.predict(members[time_index], previous, branch=branch)
         if not math.isfinite(np.vdot(predicted, predicted)):
             is_unseen = np.asarray(np.isnan(predicted).any(axis=-2))
             step.note_unseen(group, is_unseen, "some members cannot see")
-        group = step.gate(group, sample_moments, predicted, is_torn=weights_members)
+        group = step.gate(
+            group, sample_moments, predicted, near_observed=weights_members
+        )
         if weights_members and self.periods:
+            # The update takes weighted means: angles are brought near their weighted mean.
             logs = log_likelihood(predicted, group.target, group.noise)
             weights = normalize_weights(logs)
             members = tuple([fold(x, self.periods, weights) for x in members])
-        # An update that predicts again needs the present members alone.
+        # An update that moves members in several parts predicts again in between. It can do so if
+        # there are no earlier members to be moved along.
         predict = None
         if self._repredicts and len(stack) == 1:
             predict = partial(group.predict, previous=previous, branch=branch)
+        # The places of the observations, for an update that is localised: none or one array
         located = self._locate_observations(group) if self._locates else ()
-
-        def compute(
-            h: Array,
-            y: Array,
-            *args: *tuple[*tuple[Array, ...], Array, Rng],
-        ) -> tuple[Array, ...]:
-            *arrays, noise, rng = args
-            # The places of the observations come behind the members of all times.
-            places = arrays.pop() if located else None
-            *past, present = arrays
-            # The group predicts for all rows, not for one alone, as after an error in the batch.
-            predict_again = predict if h.shape == predicted.shape else None
-            # All times' members meet the same draws, so that the separate updates are one joint
-            # update; the last of them advances the generator.
-            updated = [
-                self._update(x, h, y, noise, copy_rng(rng), predict=None, places=places)
-                for x in past
-            ]
-            new = self._update(
-                present, h, y, noise, rng, predict=predict_again, places=places
-            )
-            return (*updated, new)
-
+        update_times = partial(
+            self._update_times,
+            has_places=bool(located),
+            predict=predict,
+            batch_shape=predicted.shape,
+        )
         results = step.apply(
-            compute,
+            update_times,
             (predicted, group.target, *members, *located),
             members,
             group.agents,
             shared=group.noise,
             rng=step.rng,
         )
-        # Other agents' members are not touched.
+        # Only the members of the group's agents are replaced.
         for ensembles, new in zip(stack, results, strict=True):
             ensembles[..., rows, :, :] = new
 
-    def _locate_observations(self, group: Received) -> tuple[Array, ...]:
-        """Return the places (*runs, G, M, k) of a group's observations, if they are not common.
+    def _update_times(
+        self,
+        h: Array,
+        y: Array,
+        # Any: arrays, and a generator as the last.
+        *args: Any,
+        has_places: bool,
+        predict: Callable[[Array], Array] | None,
+        batch_shape: tuple[int, ...],
+    ) -> tuple[Array, ...]:
+        """Update the members of all times by predictions of the observations.
 
-        An update with one array of places fits agents that all receive the same observations.
+        Parameters
+        ----------
+        h, y : ndarray, (..., N, M) and (..., M)
+            The predictions and the observations.
+        *args
+            As :meth:`Step.apply` passes them: members (..., N, d) of all times, the present ones
+            last; the places of the observations, if there are any; the noise that all rows share;
+            a generator. If the whole batch fails, it passes one run of one agent after the other.
+        has_places : bool
+            Whether the places are among them.
+        predict : callable or None
+            Predicts the observations of members of the whole batch, for an update that needs it.
+        batch_shape : tuple of int
+            Shape of the whole batch's predictions.
         """
+        *arrays, noise, rng = args
+        places = arrays.pop() if has_places else None
+        *past, present = arrays
+        # The function predicts for the whole batch, not for a single run and agent.
+        predict_again = predict if h.shape == batch_shape else None
+        # The updates of all times use copies of one generator, and so the same draws: then they are
+        # one joint update. The last of them advances the generator.
+        updated = [
+            self._update(x, h, y, noise, copy_rng(rng), predict=None, places=places)
+            for x in past
+        ]
+        new = self._update(
+            present, h, y, noise, rng, predict=predict_again, places=places
+        )
+        return (*updated, new)
+
+    def _locate_observations(self, group: Received) -> tuple[Array, ...]:
+        """Return the places (*runs, G, M, k) of a group's observations; none if they are common.
+
+        A localised update has a mapping from sensors to places in k dimensions, or one array of
+        places. The array fits agents that all receive the same observations, and then nothing is
+        passed on.
+        """
+        # The mapping as a function of a sensor; None for an array
         locate = find_locate(self.update)
         if locate is None:
             self._check_common_places(group)
@@ -413,13 +466,13 @@ class EnsembleFilter(
 
     def _check_common_places(self, group: Received) -> None:
         """Refuse one array of places where agents, or steps, have different observations."""
-        received = [part.sensor for part in group.parts]
-        known = set(received)
+        sensors = [part.sensor for part in group.parts]
+        of_group = set(sensors)
         is_common = group.has_same_sensors
         for agent in group.agents.tolist():
-            own = set(self.agent_sensors[agent])
-            # Without one of the agent's own sensors another step has other observations.
-            is_common &= not (own & known) or own <= known
+            of_agent = set(self.agent_sensors[agent])
+            # If only some of the agent's sensors are there, another step will have others.
+            is_common &= not (of_agent & of_group) or of_agent <= of_group
         if not is_common:
             raise ValueError(
                 "observation_places must be a mapping from each sensor to its place where "
@@ -454,7 +507,7 @@ class EnsembleFilter(
             The places of the observations, for an update that is localised by them.
         """
         if self._repredicts:
-            # It takes ensembles of several agents, and missing observations, by itself.
+            # Such an update accepts ensembles of several agents, and missing observations.
             options = {} if places is None else {"observation_places": places}
             new = call_user(
                 self.update,
@@ -475,6 +528,7 @@ class EnsembleFilter(
             _check_shape(new, "update", members.shape)
             return new
         # A function of the user's gets one agent's ensemble, and one covariance, at a time.
+        # Without leading axes there is only one ensemble (N, d).
         if members.ndim == 2:
             return self._update_one(members, predicted, observed, noise, rng)
         updated = []
@@ -494,6 +548,7 @@ class EnsembleFilter(
         self, members: Array, predicted: Array, observed: Array, noise: Array, rng: Rng
     ) -> Array:
         """Update one agent's ensembles by the user's function, which may work in place."""
+        # The update gets complete observations only; rows with missing numbers are treated apart.
         new = with_missing(
             self.update,
             members.copy(),
@@ -571,7 +626,8 @@ class TransportFilter(_EnsembleSummary):
                 "prior must be one for all agents of a TransportFilter, which have the same "
                 "members, got a list with one for each"
             )
-        # One draw, repeated for every agent.
+        # One draw, repeated for every agent; angles are shifted by whole periods, so that the mean
+        # is in [-period/2, period/2).
         common = settle(self.draw_prior(prior, (*runs, 1), rng), self.periods)
         return {"ensembles": np.repeat(common, self.n_agents, axis=-3)}
 
@@ -586,6 +642,7 @@ class TransportFilter(_EnsembleSummary):
         """
         state = step.state
         members = state.ensembles
+        # Agents that cannot send would weight the common members differently.
         is_cut_off = self.n_agents > 1 and callable(self.graph) and step.channel is None
         if is_cut_off and any((*step.observations, step.delayed)):
             raise ValueError(
@@ -594,11 +651,13 @@ class TransportFilter(_EnsembleSummary):
             )
         if step.dt:
             if self.periods:
+                # A full turn of an angle before the step has to be a full turn after it.
                 check_transition(self.model, members.mean(axis=-2), state.t, step.dt)
             sample_step = partial(self.model.sample_step, t=state.t, dt=step.dt)
             members = self._draw_in_common(sample_step, (members,), step.rng)
             if self.notices_wrapping:
                 warn_of_wrapping(self.model, state.ensembles, members, state.t, step.dt)
+        # The members of the earlier times that are kept, oldest first, and the present ones last
         stack = step.stack(step.check_forecast(members, state.ensembles))
         (logs,) = step.fuse(self._log_likelihoods(stack, step))
         if step.has_fusion:
@@ -611,6 +670,7 @@ class TransportFilter(_EnsembleSummary):
         stack = self._transport(stack, logs, step)
         self._warn_of_collapse(logs, step)
         if self.periods:
+            # Angles are shifted alike by whole periods: their mean lies in [-period/2, period/2).
             stack = [settle(members, self.periods) for members in stack]
         return step.end(ensembles=stack[-1], past=stack[:-1])
 
@@ -625,13 +685,18 @@ class TransportFilter(_EnsembleSummary):
 
     def draw_normal(self, shape: tuple[int, ...], rng: Rng) -> Array:
         """Draw standard normal numbers, the same for all agents."""
+        # An axis of agents of length 1 broadcasts.
         *runs, _n_agents, n, d = shape
         return rng.standard_normal((*runs, 1, n, d))
 
     def _draw_in_common(
         self, draw: Callable[..., Array], arrays: tuple[Array, ...], rng: Rng
     ) -> Array:
-        """Apply `draw` agent by agent, each with the same draws; the generator advances once."""
+        """Apply a function to the agents' arrays (*runs, A, N, d), with the same draws for all.
+
+        Every agent gets a copy of the generator, and the last one the generator itself, which thus
+        advances once.
+        """
         generators = [copy_rng(rng) for _ in range(self.n_agents - 1)] + [rng]
         results = []
         for agent, generator in enumerate(generators):
@@ -642,16 +707,19 @@ class TransportFilter(_EnsembleSummary):
     def _log_likelihoods(self, stack: list[Array], step: Step[EnsembleState]) -> Array:
         """Return the log-likelihoods of each agent's observations, (*runs, A, N)."""
         logs = np.zeros(stack[-1].shape[:-1])
-        for place, group in step.received():
+        for time_index, group in step.received():
+            # The index of the group's agents in arrays (*runs, A, ...)
             rows = group.rows
+            # The earlier members with which a sensor of changes compares
             previous = None
             if group.changes:
-                previous = step.before(place, group, stack[:-1])
-            members = stack[place][..., rows, :, :]
+                previous = step.find_previous(time_index, group, stack[:-1])
+            members = stack[time_index][..., rows, :, :]
             predicted = group.predict(members, previous, branch="each")
             if not all_finite(predicted):
                 is_unseen = np.asarray(np.isnan(predicted).any(axis=-2))
                 step.note_unseen(group, is_unseen, "some members cannot see")
+            # The gate predicts a sensor that is a likelihood by members with equal weights.
             weighted = None
             if group.likelihoods:
                 weighted = members, np.full(members.shape[:-1], 1 / self.members)
@@ -659,7 +727,7 @@ class TransportFilter(_EnsembleSummary):
                 group,
                 sample_moments,
                 predicted,
-                is_torn=True,
+                near_observed=True,
                 is_gaussian=False,
                 weighted=weighted,
             )
@@ -668,9 +736,11 @@ class TransportFilter(_EnsembleSummary):
             # Σ log p(y | xᵢ) over the observations that the agent has.
             logs[..., rows, :] += log_likelihood(predicted, group.target, group.noise)
             if step.scores:
+                # The constant that all members have in common, of no influence on their weights
                 normalizer = log_normalizer(group.target, group.noise)
                 logs[..., rows, :] += normalizer[..., None]
-            # Equal weights, so that only a far observation can give a warning.
+            # With equal weights (logarithms of zero) only an observation far from all predictions
+            # gives a warning; unequal ones are looked at after the consensus.
             warn_of_weights(0 * predicted[..., 0], predicted, group.target, group.noise)
         return logs
 
@@ -679,14 +749,17 @@ class TransportFilter(_EnsembleSummary):
     ) -> list[Array]:
         """Move all times' members by the transport plan of the present ones."""
         if self.periods:
-            # Costs and means need one branch: that about the weighted members' direction.
+            # Costs and means need members whose angles are near each other: within half a period
+            # of the weighted circular mean.
             weights = normalize_weights(logs)
             stack = [fold(members, self.periods, weights) for members in stack]
 
         def compute(logs: Array, *arguments: Array) -> tuple[Array, ...]:
-            # The last two are what `step.apply` adds for all rows: a shared array and a generator.
+            # The members of all times, the present ones last, come before the two arguments that
+            # `step.apply` adds for all rows: a shared array and a generator.
             *times, _shared, _rng = arguments
-            # The plan is optimal for the present members and moves their past along.
+            # The plan from weighted to equally weighted members is optimal for the present ones,
+            # and moves their past along. With `correct` they get the weighted covariance too.
             weights = normalize_weights(logs)
             plan = transport_plans(times[-1], logs)
             return tuple(
@@ -703,7 +776,8 @@ class TransportFilter(_EnsembleSummary):
             for new, old, generator in zip(moved, stack, generators, strict=True):
                 jittered.append(self._draw_in_common(draw, (new, old), generator))
             moved = tuple(jittered)
-        # Without an observation all likelihoods are equal, and the members stay as they were.
+        # Without an observation all likelihoods of an agent are equal, with a range of zero, and
+        # its members stay as they were.
         is_observed = (np.ptp(logs, axis=-1) > 0)[..., None, None]
         return [
             np.where(is_observed, new, old)
@@ -711,7 +785,7 @@ class TransportFilter(_EnsembleSummary):
         ]
 
     def _warn_of_collapse(self, logs: Array, step: Step[EnsembleState]) -> None:
-        """Warn once if one member has nearly all the weight: its copies are left to go on from."""
+        """Warn once if one member has nearly all the weight: its copies replace the others then."""
         weights = normalize_weights(logs[~step.failed])
         size = effective_size_of(weights).min(initial=np.inf)
         # Of fewer than two members the weighted variance is half of the right one or less, and
@@ -726,17 +800,20 @@ class TransportFilter(_EnsembleSummary):
 
 
 def fuse_members(step: Step[AnyState], members: Array) -> Array:
-    """Return members (*runs, A, N, d) after the fusion rule, on the branch before it.
+    """Return members (*runs, A, N, d) after the fusion rule.
 
-    The rule gets all agents' members on one branch.
+    The rule gets angles of all agents that are near each other: each agent's are shifted by whole
+    periods, and shifted back after it.
     """
     periods = step.filter.periods
     if not periods:
         (fused,) = step.fuse(members)
         return fused
+    # Every agent's mean within half a period of the agents' circular mean
     means = members.mean(axis=-2)
     shift = (fold(means, periods) - means)[..., None, :]
     (fused,) = step.fuse(members + shift)
+    # A rule of the user's may wrap angles, so that some members lie a period away from the rest.
     return np.asarray(fold_torn(fused, periods) - shift)
 
 
@@ -748,13 +825,14 @@ def regress_past(stack: list[Array], fused: Array) -> list[Array]:
     *past, present = stack
     if fused is present or not past:
         return past
-    # In units of the standard deviations, so that the cut of small eigenvalues has no units.
+    # In units of the standard deviations, so that the cut of small eigenvalues has no units:
+    # C is the correlation of the present members, A their scaled anomalies, Δ the scaled shift.
     correlation, std = to_unit_variances(moments.sample_covariance(present))
     n = present.shape[-2]
     inverse = np.linalg.pinv(correlation, rcond=1e-10, hermitian=True) / (n - 1)
     scaled = center_ensemble(present).anomalies / std[..., None, :]
     shift = (fused - present) / std[..., None, :]
-    # x_past + Δ C⁻¹ Aᵀ x_past / (N - 1)
+    # x_past + Δ C⁻¹ Aᵀ x_past / (N - 1), with Aᵀ x_past / (N - 1) the cross-covariance
     return [x + shift @ (inverse @ (scaled.mT @ x)) for x in past]
 
 

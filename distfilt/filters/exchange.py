@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from .states import AnyState
     from .step import Step
 
-__all__ = ["Known", "collect_observations", "fuse_beliefs"]
+__all__ = ["ObservationsByTime", "collect_observations", "fuse_beliefs"]
 
-Known = dict[float, list[list[tuple[Sensor, Array]]]]
+ObservationsByTime = dict[float, list[list[tuple[Sensor, Array]]]]
 """By time and then by agent: the sensors and values of the observations that the agent has."""
 
 
-def collect_observations(step: Step[AnyState]) -> Known:
+def collect_observations(step: Step[AnyState]) -> ObservationsByTime:
     """Share the step's observations, and sort by time those that each agent has then.
 
     An agent has its own observations and those that others sent, ordered by their agents.
@@ -46,16 +46,18 @@ def collect_observations(step: Step[AnyState]) -> Known:
     for observation in step.delayed:
         observed[observation.agent].append(observation)
     sent = _choose_outgoing(step, observed)
+    # For each agent the payloads that it receives, by their sender
     inbox: Sequence[Mapping[int, Payload]] = [{} for _ in observed]
     if sent and step.filter.hops != 1:
         inbox = _flood(step, sent)
     elif sent:
         inbox = step.channel.broadcast(_pack(step, sent))
     own_labels = _label(step, observed)
-    # Receivers know their neighbours' sensors, so only values travel.
+    # Receivers know their neighbours' sensors, so only values travel, and the time and sensor of
+    # each are looked up here. Without pending observations what is sent is what was observed.
     has_waited = bool(cast(SensorState, step.state).pending)
     sent_labels = _label(step, sent) if has_waited else own_labels
-    by_time: Known = {}
+    by_time: ObservationsByTime = {}
     # Most filters have neither a gate nor sensors of changes.
     is_noted = step.streaks is not None or step.references is not None
     for agent, messages in enumerate(inbox):
@@ -72,7 +74,8 @@ def collect_observations(step: Step[AnyState]) -> Known:
                 values = list(payload) if isinstance(payload, tuple) else [payload]
             if is_noted:
                 _note_received(step, agent, listed)
-            # The part behind the values counts as communication alone.
+            # A payload may end with numbers that describe the values. They count as communication,
+            # and are not read: zip stops at the last value.
             for (t, sensor), value in zip(times_and_sensors, values, strict=False):
                 if t not in by_time:
                     by_time[t] = [[] for _ in observed]
@@ -87,6 +90,7 @@ def _note_received(
     if step.streaks is not None:
         for observation in observations:
             step.streaks.note(observation.t, agent, observation)
+    # A delayed observation is never of a sensor of changes.
     if step.references is not None:
         for observation in observations:
             if observation.t == step.t:
@@ -96,10 +100,11 @@ def _note_received(
 def _choose_outgoing(
     step: Step[AnyState], observed: list[list[Observation]]
 ) -> list[list[Observation]]:
-    """Choose each agent's messages of this step: nothing, or its new and its pending observations.
+    """Choose the observations that each agent sends in this step: its pending and its new ones.
 
-    Without a channel at this time, the observations wait in ``step.pending`` for the next one, if
-    the filter has a lag; otherwise they are never sent.
+    The list is empty if agents do not share observations. Without a channel at this time nothing is
+    sent: the observations wait in ``step.pending`` for the next one, if the filter has a lag, and
+    otherwise they are never sent.
     """
     f = step.filter
     if not f.share_observations or f.graph is None:
@@ -169,15 +174,16 @@ def _pack(step: Step[AnyState], sent: list[list[Observation]]) -> list[Payload |
 def _describe(step: Step[AnyState], sent: list[list[Observation]]) -> list[list[float]]:
     """Return the numbers that travel with each agent's observations.
 
-    They are time, sensor and metadata of each. One present observation of the agent's first
-    sensor needs none.
+    They are time, sensor and metadata of each, as a receiver needs them to use the value. Of a
+    single observation of the present time they can be left out where receivers know its sensor: the
+    agent's first one, or one of the observation's own without metadata.
     """
     described = []
     for observations in sent:
         numbers: list[float] = []
         if len(observations) == 1:
             (only,) = observations
-            # Time and sensor go without saying: now, and the first one.
+            # Time and sensor need not be sent: they are now, and the agent's first one.
             if only.t == step.t and only.sensor == 0 and not only.metadata:
                 described.append(numbers)
                 continue
@@ -185,7 +191,7 @@ def _describe(step: Step[AnyState], sent: list[list[Observation]]) -> list[list[
             # A sensor of the observation's own has no number; its metadata describe it.
             number = observation.sensor if isinstance(observation.sensor, int) else -1
             numbers += [observation.t, number, *observation.metadata]
-        # So does a sensor of its own without metadata.
+        # -1 and no metadata: nothing that would describe the sensor
         is_plain = len(observations) == 1 and numbers == [step.t, -1]
         described.append([] if is_plain else numbers)
     return described
@@ -194,11 +200,11 @@ def _describe(step: Step[AnyState], sent: list[list[Observation]]) -> list[list[
 def _flood(
     step: Step[AnyState], sent: list[list[Observation]]
 ) -> Sequence[Mapping[int, Payload]]:
-    """Send observations over several links; the values that each agent receives, by their agent.
+    """Send observations over several links; return the values that each agent receives, by origin.
 
     The number of the agent that made them travels with them, since a receiver does not know it from
-    the link by which they come. Behind it are time, sensor and metadata of each observation, unless
-    these go without saying.
+    the link by which they come. It is followed by time, sensor and metadata of each observation,
+    where these are needed, see :func:`_describe`.
     """
     bundles: list[tuple[Array, ...] | None] = []
     labels = []
@@ -206,7 +212,7 @@ def _flood(
         values = tuple([observation.value for observation in sent[agent]])
         # An agent without observations sends nothing of its own.
         bundles.append(values or None)
-        # As numbers, which the channel counts.
+        # An array, since the channel counts the numbers in a message.
         labels.append(np.array([agent, *description], dtype=float))
     # How many links an observation travels at most
     hops = step.filter.hops
@@ -222,6 +228,7 @@ def _label(
     for observations in observed:
         of_agent = []
         for observation in observations:
+            # A sensor that comes with its observation, or the number of one of the agent's
             sensor = observation.sensor
             if not isinstance(sensor, Sensor):
                 sensor = step.filter.agent_sensors[observation.agent][sensor]
@@ -242,7 +249,10 @@ def fuse_beliefs(step: Step[AnyState], values: tuple[Array, ...]) -> tuple[Array
         # `keep_failed` puts its second argument into the failed runs. One run at least is good:
         # otherwise nothing is fused.
         good = tuple(np.argwhere(~step.failed)[0])
+        # The values of the first good run, (A, ...), broadcast to all runs.
         inputs = [step.keep_failed(v, v[good]) for v in inputs]
+    # Each run's number travels with its values, so that its channel loses the same messages alone
+    # as in the batch.
     run_numbers = _number_runs(step.runs)
     channel = step.channel
     ledger = channel.ledger
@@ -254,7 +264,7 @@ def fuse_beliefs(step: Step[AnyState], values: tuple[Array, ...]) -> tuple[Array
         # The last two are what `step.apply` adds for all rows: a shared array and a generator.
         *beliefs, numbers, _shared, _rng = arguments
         attempt = channel.for_run(numbers.astype(np.intp), ledger)
-        # A rule of a family that fuses in a step is a function.
+        # A cast: a filter's `fusion` may be None or a protocol, but not where this is called.
         rule = cast("Callable[..., object]", step.filter.fusion)
         results = _apply_rule(rule, beliefs, attempt)
         used.append(attempt)
@@ -284,6 +294,7 @@ def _apply_rule(
     """Call a fusion rule, with one array or a tuple of them, and check its results."""
     is_single = len(beliefs) == 1
     fused = call_user(rule, beliefs[0] if is_single else tuple(beliefs), channel)
+    # A rule of one array returns an array, one of several arrays a tuple or list of as many.
     results: tuple[object, ...] = (fused,)
     if not is_single:
         results = tuple(fused) if isinstance(fused, Iterable) else ()
@@ -308,12 +319,22 @@ def _merge_channels(
 ) -> Channel:
     """Return the channel whose ledger counts the fusion once.
 
-    A batch is charged like one run. If only single runs could be fused, their messages cost the
-    same, and the lost ones are averaged as a batch's would be.
+    A ledger counts the messages of one run; those that are lost in some runs are averaged.
+
+    Parameters
+    ----------
+    before : Channel
+        The channel of the step, before the fusion.
+    used : list of Channel
+        The channels of the attempts that went through: one of all runs, or one for each run that
+        could be fused. All runs send the same numbers.
+    run_numbers : ndarray, (*runs)
+        Numbers of the runs, for the channel that is returned.
     """
     for_batch = [channel for channel in used if channel.runs == run_numbers.shape]
     if for_batch:
         return for_batch[-1]
+    # What was sent is the same in each ledger; what was lost is not.
     lost = np.mean([channel.ledger.lost for channel in used], axis=0)
     ledger = used[-1].ledger.replace(lost=lost)
     return before.for_run(run_numbers.astype(np.intp), ledger)

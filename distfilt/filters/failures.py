@@ -103,11 +103,12 @@ def recompute_rows(
     errors : dict
         The reason for each failure, by the row's index.
     """
-    # A row is one run, or one run of one agent.
+    # The indices of all rows: of one run, or of one agent in one run
     rows = list(np.ndindex(arrays[0].shape[:lead]))
     results = tuple([values.copy() for values in fallback])
     errors: dict[Row, str] = {}
     for row in rows:
+        # One matrix for each agent, or one for all
         row_shared = shared[row[-1]] if shared.ndim > 2 else shared
         try:
             row_results = compute(*[a[row] for a in arrays], row_shared, rng)
@@ -127,6 +128,7 @@ def recompute_rows(
     substituted = [a[indices].reshape(a.shape) for a in arrays]
     if rng is not None and rng_state is not None:
         rng.bit_generator.state = rng_state
+    # If the batch fails all the same, the results are those of the rows computed alone.
     with suppress(*RECOVERABLE):
         results = compute(*substituted, shared, rng)
     return results, errors

@@ -82,7 +82,8 @@ class _Flood:
         n_agents = graph.n_agents
         self.opposite = find_opposite(graph)
         self.known: list[dict[int, Bundle]] = [{} for _ in bundles]
-        # By agent and maker: whether the agent has the maker's bundle.
+        # A bundle's maker is the agent whose observations it holds. By agent and maker: whether the
+        # agent has the maker's bundle.
         self.present = np.zeros((n_agents, n_agents, *channel.runs), dtype=bool)
         for agent, bundle in enumerate(bundles):
             if bundle is not None:
@@ -90,20 +91,22 @@ class _Flood:
                 self.present[agent, agent] = _find_present(bundle)
         # Whether it has received the bundle in the last round.
         self.fresh = self.present.copy()
-        # By link and maker: whether the bundle has come over the link; the last row stands for
-        # no link at all, as the opposite of one that goes one way.
+        # By link and maker: whether the bundle has come over the link. The last row is that of the
+        # opposite of a link that goes one way: nothing comes over it.
         n_links = graph.senders.size
         self.came = np.zeros((n_links + 1, n_agents, *channel.runs), dtype=bool)
 
     def send_fresh(self) -> None:
-        """Send the fresh bundles over each link over which they have not come."""
+        """Send the bundles received last over each link, but not back to where they came from."""
         senders = self.channel.graph.senders
-        # Split horizon: the sender of the opposite link has what came over it.
+        # Split horizon: what came over the opposite link is known at the other end. By link, maker
+        # and run, (L, A, *runs).
         wanted = self.fresh[senders] & ~self.came[self.opposite]
         payloads = []
         for link, sender in enumerate(senders.tolist()):
             payloads.append(self._pack(sender, wanted[link]))
         # One transmission for all receivers holds the bundles that any of them needs.
+        # By sender, maker and run: whether one of the sender's links wants the bundle
         needed = np.zeros_like(self.fresh)
         np.logical_or.at(needed, senders, wanted)
         common = [self._pack(agent, rows) for agent, rows in enumerate(needed)]
@@ -114,7 +117,11 @@ class _Flood:
                 self._receive(link, wanted[link], payload)
 
     def _pack(self, agent: int, wanted: Mask) -> Bundle | None:
-        """Return the payload of an agent's bundles in the runs (A, *runs) that want them."""
+        """Return the payload of an agent's bundles; None if none is wanted.
+
+        `wanted` (A, *runs) says by maker in which runs; in the others the values are NaN. Each
+        bundle is followed by its label.
+        """
         parts: list[Array] = []
         runs = self.channel.runs
         for maker in _list_makers(wanted):
@@ -130,6 +137,7 @@ class _Flood:
         """Add the bundles in a message to those that the receiver has."""
         receiver = int(self.channel.graph.receivers[link])
         sender = int(self.channel.graph.senders[link])
+        # The payload is taken apart as `_pack` has put it together.
         start = 0
         for maker in _list_makers(wanted):
             stop = start + len(self.known[sender][maker])
@@ -145,7 +153,8 @@ class _Flood:
     def _keep(self, agent: int, maker: int, bundle: Bundle, is_new: Mask) -> None:
         """Take the values of a bundle in the runs in which it is new to an agent."""
         box = self.known[agent]
-        # If the agent had none in any run, the new one fills all: only `present` runs are read.
+        # If the agent had none in any run, the new one fills all runs: where it is not `present`
+        # nobody reads it.
         old = box.get(maker, bundle)
         mask = is_new[..., None]
         values = [np.where(mask, new, v) for new, v in zip(bundle, old, strict=True)]
@@ -155,7 +164,7 @@ class _Flood:
 
 
 def _list_makers(wanted: Mask) -> list[int]:
-    """Return the makers whose bundles some run wants."""
+    """Return the makers whose bundles some run wants, from flags (A, *runs)."""
     by_maker = wanted.reshape(len(wanted), -1)
     return [int(maker) for maker in np.flatnonzero(by_maker.any(axis=1))]
 

@@ -34,7 +34,7 @@ class RejectionStreaks:
     ----------
     counts : ndarray, (*runs, A, B, S + 1)
         For each agent, each source, and each of the source's sensors. Sensors that come with their
-        observations are counted together, in the last place. Of A agents that share their
+        observations are counted together, in the last column. Of A agents that share their
         observations all are sources, B = A; otherwise an agent has its own alone, B = 1.
 
     Examples
@@ -65,24 +65,27 @@ class RejectionStreaks:
         self.has_sources = filter_.sends_observations
         self.n_agents = filter_.n_agents
         self.n_sources = self.n_agents if self.has_sources else 1
-        # One more place than an agent has sensors at most.
-        self.n_places = 1 + max(len(sensors) for sensors in filter_.agent_sensors)
-        shape = (*runs, self.n_agents, self.n_sources, self.n_places)
+        # S + 1: a column for each of an agent's sensors, as many as one agent has at most, and the
+        # last one for those that come with their observations
+        self.n_columns = 1 + max(len(sensors) for sensors in filter_.agent_sensors)
+        shape = (*runs, self.n_agents, self.n_sources, self.n_columns)
         before = state.rejection_streaks
         if before is None or before.shape != shape:
             # The first step, or one of a filter with other sensors.
             before = np.zeros(shape)
         self.counts: Array = before
+        # Whether the counts are still the array of the state before, which must not change
         self._is_shared = True
         # By time and agent: the streak that each of the agent's observations belongs to.
         self._numbers: dict[float, list[list[int]]] = {}
 
     def number_of(self, agent: int, observation: Observation) -> int:
         """Return which of all streaks, counted row by row, an agent's observation belongs to."""
+        # The index of a streak in `counts` is (agent, source, column), in row-major order.
         source = observation.agent if self.has_sources else 0
         sensor = observation.sensor
-        place = sensor if isinstance(sensor, int) else self.n_places - 1
-        return (agent * self.n_sources + source) * self.n_places + place
+        column = sensor if isinstance(sensor, int) else self.n_columns - 1
+        return (agent * self.n_sources + source) * self.n_columns + column
 
     def note(self, t: float, agent: int, observation: Observation) -> None:
         """Note that an agent has one more observation of time `t`."""
@@ -105,10 +108,11 @@ class RejectionStreaks:
             Whether it was rejected, and whether it was not; neither if it was missing.
         """
         if self._is_shared:
-            # The state before the step has the same array.
+            # The counts are still the array of the state before the step.
             self.counts = self.counts.copy()
             self._is_shared = False
-        # Several observations of one sensor in a step belong to one streak.
+        # Several observations of one sensor in a step belong to one streak: `used` are the
+        # different streaks, `inverse` (K,) the position of each observation's streak among them.
         used, inverse = np.unique(numbers, return_inverse=True)
         # Any: numpy's types of `at` have no index of several axes.
         index: Any = (..., inverse)
@@ -117,9 +121,9 @@ class RejectionStreaks:
         n_kept = np.zeros_like(n_rejected)
         np.add.at(n_rejected, index, rejected)
         np.add.at(n_kept, index, kept)
-        # A view: all streaks in one row.
+        # A view (*runs, all streaks), so that the assignment changes the counts
         row = self.counts.reshape(*runs, -1)
-        # One that passes ends the streak.
+        # An observation that passes ends the streak.
         after = np.where(n_kept > 0, 0.0, row[..., used] + n_rejected)
         row[..., used] = after
         has_reached = (after >= LIMIT) & (n_rejected > 0)
@@ -130,32 +134,36 @@ class RejectionStreaks:
 
         Observations that cannot be predicted, of which the `mean` (*runs, G, M) is NaN, are none.
         """
+        # The gate has put NaN in place of the numbers that it rejects.
         is_present = ~np.isnan(before.target - mean)
         is_kept = is_present & ~np.isnan(after.target)
         # Without a rejection, now or before, nothing changes.
         if (is_present == is_kept).all() and not self.counts.any():
             return None
+        # Of the group's K observations: the streak of each, and which observation of which agent it
+        # is, counted in the group and in the agent.
         numbers: list[int] = []
         owners: list[tuple[int, int]] = []
         for g, of_agent in enumerate(before.streaks):
             numbers += of_agent
             owners += [(g, k) for k in range(len(of_agent))]
         rows, ranks = np.array(owners).T
-        # Which numbers of its agent each observation has, (K, M).
+        # Which of its agent's M numbers each observation has, (K, M)
         has = before.sensor_index[rows] == ranks[:, None]
         present = (is_present[..., rows, :] & has).any(axis=-1)
         kept = (is_kept[..., rows, :] & has).any(axis=-1)
         has_reached = self.count(np.array(numbers), present & ~kept, kept)
         if not has_reached.any():
             return None
+        # The first observation whose streak has reached the limit, in any run
         *_run, first = np.argwhere(has_reached)[0].tolist()
         kind = before.kind_of(int(rows[first]), int(has[first].argmax()))
         return self.describe(numbers[first], kind)
 
     def describe(self, number: int, kind: str) -> str:
         """Return the warning of a gate that keeps rejecting observations of one streak."""
-        # As :meth:`number_of` counts: number = (agent n_sources + source) n_places + place.
-        agent, source = divmod(number // self.n_places, self.n_sources)
+        # As :meth:`number_of` counts: number = (agent n_sources + source) n_columns + column.
+        agent, source = divmod(number // self.n_columns, self.n_sources)
         origin = ""
         if self.has_sources and source != agent:
             origin = f" from agent {source}"

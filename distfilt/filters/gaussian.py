@@ -52,7 +52,7 @@ from .step import Received, Step
 
 __all__ = ["GaussianFamily", "GaussianFilter", "GaussianState"]
 
-_FARTHEST = 1e6
+_MAX_SHIFT = 1e6
 """The longest step of an iterated update, in standard deviations of the forecast."""
 
 
@@ -98,11 +98,11 @@ class GaussianState(SensorState):
 
     @property
     def lagged_states(self) -> tuple[Self, ...]:
-        """A state for each of these times, given all observations up to now."""
+        """A state for each of the earlier `times`, given all observations up to now."""
         states = []
         n = len(self.history)
+        # The present state is block 0, the latest earlier one block 1, the oldest block n.
         for k, t in zip(range(n, 0, -1), self.times, strict=True):
-            # The present state is the first block, the latest earlier one the second.
             block = slice(k * self.dim, (k + 1) * self.dim)
             mean = self.joint_means[..., block]
             cov = self.joint_covariances[..., block, block]
@@ -189,6 +189,7 @@ class GaussianFamily(
         d = self.model.dim
         mean, cov = moments_by_agent(prior, d, self.n_agents, periods=self.periods)
         lead = (*runs, self.n_agents)
+        # Angles in [-period/2, period/2)
         mean = wrap_differences(mean, self.periods)
         # Without a past the joint state is the present one.
         return {
@@ -210,14 +211,15 @@ class GaussianFamily(
             If a standard deviation after the fusion is below the rounding of its mean.
         """
         means, covs = self._check_forecast(step)
-        # A forecast's covariances are symmetric up to rounding. Joseph's form makes those of a
-        # group's agents exactly symmetric; after a group of all agents all are.
+        # A forecast's covariances are symmetric up to rounding. The update, in Joseph's form, makes
+        # those of a group's agents exactly symmetric; after a group of all agents all are.
         is_symmetric = False
-        # Observations come oldest first; their place is that of their time among those kept.
-        for place, group in step.received():
-            means, covs = self._condition(means, covs, place, group, step)
+        # Groups of agents with equally many observations of one time, oldest first; the index is
+        # that of this time among those kept, of which the last is now.
+        for time_index, group in step.received():
+            means, covs = self._condition(means, covs, time_index, group, step)
             is_symmetric = is_symmetric or len(group.agents) == self.n_agents
-        # A run that failed here needs a covariance with a Cholesky factor in the fusion.
+        # A run that failed here gets the identity, since the fusion factors all covariances.
         covs = step.keep_failed(covs, old=identity(means.shape[-1]))
         if step.has_fusion:
             means, covs = self._fuse(means, covs, step)
@@ -227,7 +229,10 @@ class GaussianFamily(
         return self._end(step, means, covs)
 
     def _check_forecast(self, step: Step[GaussianState]) -> tuple[Array, Array]:
-        """Return the forecast's joint moments; failed runs get a harmless Gaussian."""
+        """Return the forecast's joint moments, (*runs, A, D) and (*runs, A, D, D).
+
+        Failed runs get a standard normal, so that the batch can go on.
+        """
         means, covs = self._forecast(step)
         if all_finite(means) and all_finite(covs) and not step.any_failed:
             return means, covs
@@ -243,8 +248,8 @@ class GaussianFamily(
         The covariances are symmetric to the last digit.
         """
         if self.periods:
-            # The mean of each time by itself: a covariance does not depend on the branch.
-            # They stand behind one another, with the same periods.
+            # Angles of the means in [-period/2, period/2); covariances do not depend on that. The
+            # joint mean has the means of all times one behind the other, with the same periods.
             n_times = means.shape[-1] // self.model.dim
             means = wrap_differences(means, self.periods * n_times)
         # The joint moments begin with the present and go back in time, and so does the history. A
@@ -271,8 +276,10 @@ class GaussianFamily(
         if not dt:
             return state.joint_means.copy(), state.joint_covariances.copy()
         d = state.dim
-        # A single point cannot lie on both sides of a cut.
+        # Unscented points may lie on both sides of an angle's cut after the step, where their mean
+        # is wrong; a single point cannot.
         has_points = self.linearization == "unscented"
+        # `move` maps points (..., N, d) to those after the step.
         if self.periods or (self.notices_wrapping and has_points):
             move = partial(self._step_points, step)
         else:
@@ -285,9 +292,10 @@ class GaussianFamily(
             is_linear=isinstance(model, LinearModel),
         )
         mean = moved.value
-        # P = F P Fᵀ + Q, with a contiguous F.
+        # P = F P Fᵀ + Q, with a contiguous F, which multiplies faster.
         slope = np.ascontiguousarray(moved.slope)
         old = state.joint_covariances
+        # Q at each agent's mean, or one matrix for all
         if model.has_state_noise:
             noise = model.noise_at(state.means, state.t, dt)
         else:
@@ -295,6 +303,8 @@ class GaussianFamily(
         if moved.extra_cov is not None:
             noise = noise + moved.extra_cov
         cov = slope @ state.covariances @ slope.mT + noise
+        # Of the earlier states those that the step still keeps; they come first in the joint state
+        # before the step, which begins with the state's own time.
         size = len(step.times) * d
         if size:
             # The past keeps its covariance; its cross-covariance with the present becomes F P.
@@ -307,7 +317,7 @@ class GaussianFamily(
             joint[..., d:, d:] = old[..., :size, :size]
             cov = joint
         if self.inflation != 1.0:
-            # Rows and columns of the present, so that its own block gets the square.
+            # A factor of the present standard deviations: its own block gets the square.
             cov[..., :d, :] *= self.inflation
             cov[..., :, :d] *= self.inflation
         return mean, cov
@@ -324,10 +334,10 @@ class GaussianFamily(
         return model.jacobian(means, step.state.t, step.dt, std=std)
 
     def _step_points(self, step: Step[GaussianState], points: Array) -> Array:
-        """Move points (..., N, d) without noise, on one branch."""
+        """Move points (..., N, d) by the model without noise; angles are near each other then."""
         t = step.state.t
         moved = step_members(step.model, points, t, step.dt)
-        # A single point is on one branch by itself.
+        # Only of several points some may have wrapped and others not.
         if self.notices_wrapping and points.shape[-2] > 1:
             warn_of_wrapping(step.model, points, moved, t, step.dt)
         return moved
@@ -343,8 +353,8 @@ class GaussianFamily(
     ) -> _Linearization:
         """Replace a function of a Gaussian by a linear one.
 
-        ``jacobian(mean, cov)`` is the derivative at the mean (..., d); finite differences take
-        their step from the covariance.
+        ``function`` maps points (..., N, d) to values (..., N, m). ``jacobian(mean, cov)`` is the
+        derivative at the mean, (..., m, d); finite differences take their step from the covariance.
         """
         if is_linear or self.linearization == "extended":
             # For a linear function unscented points would give the same.
@@ -377,12 +387,17 @@ class GaussianFamily(
         self,
         means: Array,
         covs: Array,
-        place: int,
+        time_index: int,
         group: Received,
         step: Step[GaussianState],
     ) -> tuple[Array, Array]:
-        """Return all joint moments with a group's conditioned on its observations."""
+        """Return all joint moments, with those of a group conditioned on its observations.
+
+        The observations are of the time with the index `time_index` among those kept, oldest
+        first. They change the beliefs about all times.
+        """
         d = self.model.dim
+        # The index of the group's agents in arrays (*runs, A, ...)
         rows = group.rows
         is_part = len(group.agents) < means.shape[-2]
         joint_mean = means
@@ -393,8 +408,8 @@ class GaussianFamily(
         mean = joint_mean
         cov = joint_cov
         if mean.shape[-1] > d:
-            # The latest time comes first in the joint state, and last among the places.
-            first = (len(step.times) - place) * d
+            # The latest time comes first in the joint state, but has the last index.
+            first = (len(step.times) - time_index) * d
             block = slice(first, first + d)
             mean = joint_mean[..., block]
             cov = joint_cov[..., block, block]
@@ -451,8 +466,9 @@ class GaussianFamily(
                 group.agents,
                 shared=group.noise,
             )
-            # A step that leaves the belief is not taken, and the rest of a batch goes on.
-            is_near = np.abs(x - mean) <= _FARTHEST * deviations(cov)
+            # A step out of the region where the belief has any probability is not taken; the other
+            # rows of a batch go on.
+            is_near = np.abs(x - mean) <= _MAX_SHIFT * deviations(cov)
             x = np.where(is_near.all(axis=-1, keepdims=True), x, mean)
             predicted = group.predict(x[..., None, :], branch="first")[..., 0, :]
             new_slope = group.jacobian(x, cov)
@@ -468,7 +484,11 @@ class GaussianFamily(
     def _innovate(
         self, mean: Array, cov: Array, group: Received, step: Step[GaussianState]
     ) -> _Innovation:
-        """Compare a group's observations with predictions by Gaussians (*runs, G, d)."""
+        """Compare a group's observations with predictions by Gaussians (*runs, G, d).
+
+        With the branch "first" predicted angles are shifted by whole periods, so that the first, or
+        only, point's is within half a period of the observed value.
+        """
         predicted, slope, extra = self._linearize(
             partial(group.predict, branch="first"),
             group.jacobian,
@@ -489,7 +509,7 @@ class GaussianFamily(
         if step.tests_innovations:
 
             def moments(_points: Array) -> tuple[Array, Array]:
-                """Return the moments of the prediction, which lie on one branch."""
+                """Return the prediction's mean and covariance; the gate's points are not needed."""
                 predicted_cov = slope @ cov @ slope.mT
                 if extra is not None:
                     predicted_cov = predicted_cov + extra
@@ -507,6 +527,7 @@ class GaussianFamily(
         step: Step[GaussianState],
     ) -> Array:
         """Return predictions that are NaN where the sensor cannot see, and count these."""
+        # Of each number (*runs, G, M): whether it has no prediction, or no finite derivative
         is_unseen = np.isnan(predicted)
         reason = "some point of a belief cannot see"
         if not all_finite(slope):
@@ -516,10 +537,12 @@ class GaussianFamily(
             reason = (
                 "the sensor is at a singular point, where its derivative is zero or NaN"
             )
+            # With a derivative of zero the number would not change the belief.
             is_unseen |= ~slope.any(axis=-1)
         if is_unseen.any():
+            # Sensors that are likelihoods need no prediction and no derivative.
             for part in group.likelihoods:
-                is_unseen[(..., *part.cells)] = False
+                is_unseen[(..., *part.target_index)] = False
             step.note_unseen(group, is_unseen, reason)
         return predicted
 
@@ -544,7 +567,8 @@ class GaussianFamily(
         d = self.model.dim
         mean = means[..., :d]
         cov = symmetrise(covs[..., :d, :d])
-        # Only the present marginal is fused, with all agents' means on one branch.
+        # Only the present marginal is fused. For it the agents' angles are brought near each other
+        # by whole periods, which are taken back afterwards.
         common = fold(mean, self.periods) if self.periods else mean
         fused_mean, fused_cov = step.fuse(common, cov)
         fused_mean = fused_mean + (mean - common) if self.periods else fused_mean
@@ -554,7 +578,8 @@ class GaussianFamily(
             _check_fused(fused_mean, variance, step.t)
         if means.shape[-1] == d:
             return fused_mean, fused_cov
-        # With the gain G = P_joint,now P_now⁻¹: m + G Δm and P + G ΔP Gᵀ.
+        # With the gain G = P_joint,now P_now⁻¹ of the regression on the present, and its changes Δm
+        # and ΔP by the fusion: m + G Δm and P + G ΔP Gᵀ.
         gain = solve_semidefinite(cov, covs[..., :d, :]).mT
         shift = (gain @ (fused_mean - mean)[..., None])[..., 0]
         return means + shift, covs + gain @ (fused_cov - cov) @ gain.mT
@@ -643,6 +668,7 @@ def _check_fused(mean: Array, variance: Array, t: float) -> None:
             f"covariance after fusion is below rounding at t = {format_number(t)} s: "
             "information is probably counted twice",
             RuntimeWarning,
+            # The warning names a line five frames up, near the user's call.
             stacklevel=5,
         )
 
@@ -662,7 +688,7 @@ def _factor_covariance(cov: Array) -> tuple[Array, Array]:
     root = factor(cov)
     std = np.sqrt(np.abs(np.diagonal(cov, axis1=-2, axis2=-1)))
     scale = std[..., :, None] * std[..., None, :]
-    # A negative eigenvalue has no root, so that the product misses the covariance.
+    # The factor leaves out negative eigenvalues: then the product differs from the covariance.
     if not (np.abs(root @ root.mT - cov) <= 1e-9 * scale).all():
         raise np.linalg.LinAlgError("covariance must be positive semidefinite")
     return root, _fill_zero_columns(root)

@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 __all__ = ["GridFilter", "GridState"]
 
-_LEAST = -700.0
-"""The smallest logarithm of a cell's probability, relative to the largest."""
-_REACH = 6.0
+_MIN_LOG = -700.0
+"""The smallest logarithm of a cell's probability; its exponential is still above zero."""
+_CUTOFF = 6.0
 """Standard deviations of the process noise after which it is cut off."""
-_FINEST = 0.5
+_MIN_STD = 0.5
 """The smallest standard deviation of the process noise, in widths of a cell."""
-_MOST = 0.5
+_MAX_AT_EDGE = 0.5
 """The largest probability that the outermost cells may have without a warning."""
 
 
@@ -141,11 +141,13 @@ class GridFilter(
             raise ValueError(
                 f"model must have no circular components here, got periods {self.periods}"
             )
+        # One matrix Q for all cells makes the forecast one sparse product.
         if self.model.has_state_noise:
             raise ValueError(
                 "model must have a noise that does not depend on the state here, got a "
                 f"{type(self.model).__name__}"
             )
+        # Likelihoods are added over the agents: observations must not have been shared before.
         if self.fused == "likelihoods" and (
             self.share_observations or self.fusion is None
         ):
@@ -165,7 +167,8 @@ class GridFilter(
         else:
             mixtures = prior_mixtures(prior, self.model.dim, self.n_agents)
             logs = np.array([mixture.log_density(centres) for mixture in mixtures])
-        # ∫ p(x) dx as a sum over the cells
+        # ∫ p(x) dx as a sum over the cells, which is 1 if the grid holds the prior. Half of that is
+        # far too little.
         total = np.exp(log_sum_exp(logs)) * self.grid.volume
         if (total < 0.5).any():
             raise ValueError(
@@ -177,12 +180,14 @@ class GridFilter(
 
     def next_state(self, step: Step[GridState]) -> GridState:
         """Forecast the cells' probabilities, weight them by likelihoods, fuse."""
+        # Log-probabilities (*runs, A, n) of the cells, equal ones in failed runs
         forecast = step.keep_failed(self._forecast(step), old=0.0)
         logs = _normalize(forecast)
-        for _place, group in step.received():
+        for _time_index, group in step.received():
             self._weight(logs, group, step)
         if step.has_fusion and self.fused == "likelihoods":
-            # log p(y | x) + a constant: the change by the own observations
+            # log p(y | x) + a constant: the change by each agent's own observations. A times the
+            # average over the agents is their sum.
             (averaged,) = step.fuse(logs - _normalize(forecast))
             logs = _normalize(forecast + self.n_agents * averaged)
         elif step.has_fusion:
@@ -196,10 +201,11 @@ class GridFilter(
         centres = self.grid.centres
         weights = state.masses
         mean, cov = compute_moments(centres, weights)
-        # The variance of a uniform density on a cell
-        least = self.grid.spacing**2 / 12
-        i = np.arange(len(least))
-        cov[..., i, i] = np.maximum(cov[..., i, i], least)
+        # The variance w² / 12 of a uniform density on a cell of width w, along each axis
+        cell_variance = self.grid.spacing**2 / 12
+        # Index of the diagonal
+        i = np.arange(len(cell_variance))
+        cov[..., i, i] = np.maximum(cov[..., i, i], cell_variance)
         mean = state.mask_failed(mean)
         cov = state.mask_failed(cov)
         return Summary(mean, np.diagonal(cov, axis1=-2, axis2=-1), cov)
@@ -212,14 +218,15 @@ class GridFilter(
         t = step.state.t
         moved = self.model.step(self.grid.centres, t, step.dt)
         noise = self.model.Q(t, step.dt)
-        # A state that rests is not spread by the grid.
+        # Without motion and noise the probabilities stay: no sum over cells may spread them.
         if not noise.any() and np.array_equal(moved, self.grid.centres):
             return old
         matrix = _transition_matrix(self.grid, moved.tobytes(), noise.tobytes())
         # All runs and agents in one sparse product
         columns = step.state.masses.reshape(-1, old.shape[-1]).T
         forecast = (matrix @ columns).T.reshape(old.shape)
-        # Columns of the matrix sum to less than 1 near the sides of the box.
+        # Columns of the matrix sum to less than 1 near the sides of the box, where probability
+        # leaves it. A loss of a hundredth is worth a warning.
         total = step.keep_failed(forecast.sum(axis=-1), old=1.0)
         if (total < 0.99).any():
             step.warn_once(
@@ -227,15 +234,18 @@ class GridFilter(
                 "grid must have a box in which the state stays, but at t = "
                 f"{step.t:g} s a probability of {1 - total.min():.2g} has left it",
             )
+        # The logarithm of zero becomes a finite one, below all others.
         with np.errstate(divide="ignore"):
-            return np.asarray(np.maximum(np.log(forecast), 2 * _LEAST))
+            return np.asarray(np.maximum(np.log(forecast), 2 * _MIN_LOG))
 
     def _weight(self, logs: Array, group: Received, step: Step[GridState]) -> None:
         """Multiply a group's probabilities by the likelihood of its observations, in place."""
+        # The index of the group's agents in arrays (*runs, A, ...)
         rows = group.rows
         old = logs[..., rows, :]
         n_agents = len(group.agents)
-        # Without angles the cells' predictions do not depend on the observed value, or the run.
+        # The cells' predictions depend on the observed value, and so on the run, only if an angle
+        # is brought near it, or a sensor is a likelihood. Otherwise one for each agent is enough.
         lead = old.shape[:-1] if group.wraps else (n_agents,)
         if group.likelihoods:
             lead = old.shape[:-1]
@@ -252,13 +262,13 @@ class GridFilter(
             _predict_moments,
             predicted,
             weights,
-            is_torn=True,
+            near_observed=True,
             is_gaussian=False,
             weighted=(members, weights) if group.likelihoods else None,
         )
         group, likelihoods = group.log_likelihood(members)
 
-        # log p_i + log p(y | x_i)
+        # log p_i + log p(y | x_i); a cell without a prediction contradicts the observation.
         joint = old + likelihoods
         joint = joint + particles.log_likelihood(
             predicted, group.target, group.noise, contradict=True
@@ -273,10 +283,15 @@ class GridFilter(
             step.add_log_likelihood(total + constant, group.agents)
 
     def _warn_of_edge(self, logs: Array, step: Step[GridState]) -> None:
-        """Warn once if most of a belief lies in the outermost cells, beside which it continues."""
+        """Warn once if most of a belief lies in the outermost cells of the box.
+
+        Then the state is probably outside, where the belief has no cells. `logs` are the
+        log-probabilities (*runs, G, n) of the agents that have just been updated.
+        """
         at_edge = np.exp(logs[..., self._outermost]).sum(axis=-1)
+        # Failed runs give no warning.
         largest = step.keep_failed(at_edge, old=0.0).max(initial=0.0)
-        if largest > _MOST:
+        if largest > _MAX_AT_EDGE:
             step.warn_once(
                 "edge",
                 f"grid must have a box in which the state stays, but at t = {step.t:g} s a "
@@ -285,28 +300,32 @@ class GridFilter(
 
     @cached_property
     def _outermost(self) -> Indices:
-        """The cells at a side of the box, along axes with ten cells or more."""
+        """Indices of the cells at a side of the box, along axes with ten cells or more.
+
+        Along shorter axes the two outermost cells hold much of any belief.
+        """
         shape = np.array(self.grid.shape)
-        places = np.indices(self.grid.shape).reshape(shape.size, -1).T
-        at_side = ((places == 0) | (places == shape - 1)) & (shape >= 10)
+        # Each cell's index along every axis, (n, d)
+        indices = np.indices(self.grid.shape).reshape(shape.size, -1).T
+        at_side = ((indices == 0) | (indices == shape - 1)) & (shape >= 10)
         return np.flatnonzero(at_side.any(axis=-1))
 
 
 def _normalize(logs: Array) -> Array:
-    """Return logarithms of probabilities whose sum is 1; none is too small."""
-    return np.maximum(logs - log_sum_exp(logs), _LEAST)
+    """Return logarithms of probabilities (..., n) whose sum is 1, none below the smallest."""
+    return np.maximum(logs - log_sum_exp(logs), _MIN_LOG)
 
 
 def _normalize_joint(joint: Array, *_others: object) -> tuple[Array, Array]:
-    """Return normalised logarithms, and those of the sums.
+    """Return normalised logarithms (..., n), and those of the sums, (...).
 
     The shared array and the generator that :meth:`Step.apply` adds are not needed.
     """
     total = log_sum_exp(joint)
-    # Minus infinity, or NaN.
+    # Not so for minus infinity and NaN
     if not (total > -1e300).all():
         raise ArithmeticError("every cell has a likelihood of zero")
-    return np.maximum(joint - total, _LEAST), total[..., 0]
+    return np.maximum(joint - total, _MIN_LOG), total[..., 0]
 
 
 def _predict_moments(predicted: Array, weights: Array) -> tuple[Array, Array]:
@@ -317,7 +336,10 @@ def _predict_moments(predicted: Array, weights: Array) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=8)
 def _transition_matrix(grid: Grid, moved: bytes, noise: bytes) -> csr_array:
-    """Return the sparse matrix whose column j spreads the probability of cell j, (n, n)."""
+    """Return the sparse matrix whose column j spreads the probability of cell j, (n, n).
+
+    `moved` has the bytes of the n centres after the model's step, `noise` those of Q.
+    """
     from scipy.sparse import csr_array
     from scipy.spatial import KDTree
 
@@ -328,7 +350,7 @@ def _transition_matrix(grid: Grid, moved: bytes, noise: bytes) -> csr_array:
     # In units of a cell, the narrowest direction of the noise
     scaled = cov / grid.spacing[:, None] / grid.spacing
     narrowest = np.sqrt(max(np.linalg.eigvalsh(scaled)[0], 0.0))
-    if narrowest < _FINEST:
+    if narrowest < _MIN_STD:
         raise ValueError(
             "grid must have cells no wider than twice the standard deviation of the process "
             f"noise, got cells of {1 / max(narrowest, 1e-9):.3g} deviations"
@@ -338,7 +360,7 @@ def _transition_matrix(grid: Grid, moved: bytes, noise: bytes) -> csr_array:
     targets = solve_lower(lower, grid.centres.T).T
     sources = solve_lower(lower, points.T).T
     distances = KDTree(targets).sparse_distance_matrix(
-        KDTree(sources), _REACH, output_type="coo_matrix"
+        KDTree(sources), _CUTOFF, output_type="coo_matrix"
     )
     # N(x_i; f(x_j), Q) times the volume of a cell
     peak = grid.volume / np.sqrt((2 * np.pi) ** d) / np.diagonal(lower).prod()

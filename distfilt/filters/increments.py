@@ -71,8 +71,9 @@ def information_increment(before: GaussianMixture, after: GaussianMixture) -> Ar
     prior_root = prior.factors[0]
     posterior_root = posterior.factors[0]
     # In the frame in which the prior covariance L Lᵀ is the identity, the information is
-    # (L₊⁻¹ L)ᵀ (L₊⁻¹ L) = V diag(s²) Vᵀ.
+    # (L₊⁻¹ L)ᵀ (L₊⁻¹ L) = V diag(s²) Vᵀ. The axes are the rows of Vᵀ.
     _u, s, axes = np.linalg.svd(np.linalg.solve(posterior_root, prior_root))
+    # Beyond the prior's information, the identity; only directions with a gain are sent.
     gain = s**2 - 1
     is_gained = gain > _MIN_GAIN
     root_gain = np.sqrt(gain[is_gained])
@@ -83,7 +84,8 @@ def information_increment(before: GaussianMixture, after: GaussianMixture) -> Ar
     difference = posterior.means[0] - prior.means[0]
     shift = axes @ np.linalg.solve(prior_root, difference)
     values = rows @ prior.means[0] + s[is_gained] ** 2 / root_gain * shift
-    # Another orthogonal basis of the same observations, with zeros that need not be sent.
+    # Rotated, z and H are the same information, since the noise is that of the identity. Then H is
+    # upper triangular, with zeros that need not be sent.
     rotation, rows = np.linalg.qr(rows)
     return np.concatenate([rows, (values @ rotation)[:, None]], axis=1)
 
@@ -153,7 +155,7 @@ class InformationIncrementFilter(TargetMixtureFilter):
         super().check_parts()
         if self.graph is None:
             raise ValueError("graph must be a Graph, got None")
-        # Every sensor must have the shared components.
+        # Every sensor must have the shared components: the last index is below the smallest size.
         dims = [sensor.dim for sensors in self.agent_sensors for sensor in sensors]
         last = max(self.shared_components, default=-1)
         Bounds(below=min(dims, default=0))(last, "shared_components")
@@ -196,11 +198,13 @@ class InformationIncrementFilter(TargetMixtureFilter):
         # observations, or from before those that wait.
         unsent: list[GaussianMixture | None] = []
         waiting = step.state.unsent or (None,) * len(beliefs)
+        # `old` is the belief after the forecast, `new` that after the agent's own observations.
         for agent, (old, new) in enumerate(zip(beliefs, after, strict=True)):
             before: GaussianMixture | None = waiting[agent]
             if before is not None:
                 unsent.append(self._forecast(before, agent, step))
             else:
+                # Without an observation the belief is the same object, and nothing has to be sent.
                 unsent.append(old if new is not old else None)
         if step.channel is not None:
             outgoing = self._choose_increments(after, unsent, step)
@@ -221,15 +225,17 @@ class InformationIncrementFilter(TargetMixtureFilter):
         channel = step.channel
         target = range(self.target_dim)
         outgoing: list[Array | None] = [None] * len(after)
-        # An agent that is silent, or has no listener, sends later.
-        on = channel.faults.active_links(
+        # An agent that is silent, or has no listener, sends later: the links that work now are
+        # counted for each sender.
+        is_active = channel.faults.active_links(
             channel.graph, channel.ledger.rounds, channel.t
         )
-        listeners = np.bincount(channel.graph.senders[on], minlength=len(after))
+        listeners = np.bincount(channel.graph.senders[is_active], minlength=len(after))
         for agent, before in enumerate(unsent):
             if before is None or not listeners[agent]:
                 continue
             with step.failing_as(agent):
+                # Of the target's components. The old mean's angles are brought near the new mean's.
                 periods = self.periods[: self.target_dim]
                 new = after[agent].marginal(target)
                 old = align_mixture(before.marginal(target), new.mean, periods)
@@ -267,7 +273,7 @@ class InformationIncrementFilter(TargetMixtureFilter):
         for sender in range(len(after)):
             receivers = [a for a, messages in enumerate(inbox) if sender in messages]
             if receivers:
-                # A broadcast is the same message for all of its receivers. It says H and z, an
+                # A broadcast is the same message for all of its receivers. It holds H and z, an
                 # observation z = H x + e of the target's state x, with e ~ N(0, I).
                 message = inbox[receivers[0]][sender]
                 increment = _unpack(message, self.target_dim)
@@ -284,13 +290,15 @@ class InformationIncrementFilter(TargetMixtureFilter):
         """Assimilate an increment by its receivers, in place: by all in one call if possible."""
         periods = self.periods[: self.target_dim]
         if not any(period is not None for period in periods):
-            # An error comes again below, where it names its agent.
+            # After an error the agents assimilate it one by one below, where it names its agent.
             with suppress(*RECOVERABLE):
-                # A received increment counts for both, so that it is not sent on.
+                # It counts for the unsent beliefs too: their difference from the others, the next
+                # increment, must not hold received information.
                 waiting = [a for a in receivers if unsent[a] is not None]
                 beliefs = [after[a] for a in receivers]
                 beliefs += [cast(GaussianMixture, unsent[a]) for a in waiting]
                 updated = update_together(beliefs, *_as_observation(increment))
+                # First the receivers' beliefs, then the unsent ones
                 for agent, belief in zip(receivers, updated, strict=False):
                     after[agent] = belief
                 for agent, belief in zip(
@@ -336,7 +344,8 @@ def _choose_branch(
 ) -> Array:
     """Return an increment's values z = H t for the receiver's branch of circular components.
 
-    The sender's may be a period away: the most probable is taken.
+    The sender's target t may be a period away in each angle. Of all such shifts the one under which
+    the values are most probable is taken.
 
     >>> receiver = GaussianMixture.gaussian([-3.1], [[0.1]])
     >>> _choose_branch(receiver, np.eye(1), np.array([3.1]), (2 * np.pi,)).round(4)
@@ -344,9 +353,11 @@ def _choose_branch(
     """
     n = len(periods)
     mean, cov = belief.marginal(range(n)).moments()
+    # Shifts by one period back, none or one ahead in each angle, (S, n)
     turns = [(-1, 0, 1) if period else (0,) for period in periods]
     shifts = np.array(list(product(*turns))) * [period or 0.0 for period in periods]
-    # All candidates z + H s, compared by the length of S^(-1/2) (z + H s - H m).
+    # All candidates z + H s, compared by the length of S^(-1/2) (z + H s - H m) with the innovation
+    # covariance S = H P Hᵀ + I.
     candidates = values + shifts @ rows.T
     root = cholesky(rows @ cov @ rows.T + np.eye(len(values)))
     distances = quadratic_form(root, candidates - rows @ mean)
@@ -355,7 +366,8 @@ def _choose_branch(
 
 def _unpack(numbers: Array, n: int) -> Array:
     """Return the increment of n components, whose number of rows follows from its length."""
-    # r rows of an upper trapezoid with n + 1 columns: n + 1, n, … numbers
+    # r rows of an upper trapezoid with n + 1 columns have n + 1, n, … numbers: their sums for
+    # r = 1, …, n
     sizes = [r * (n + 1) - r * (r - 1) // 2 for r in range(1, n + 1)]
     n_rows = sizes.index(numbers.size) + 1
     increment = np.zeros((n_rows, n + 1))
@@ -382,7 +394,10 @@ def _add_increment(
 def _as_observation(
     increment: Array,
 ) -> tuple[Array, Callable[[Array], Array], Array]:
-    """Return an increment as values, the function that predicts them, and their noise."""
+    """Return an increment as values z, the function that predicts them, H x, and their noise, I.
+
+    Its rows (r, n + 1) are those of H, of the first n components of a state, with z behind them.
+    """
     rows = increment[:, :-1]
     values = increment[:, -1]
 

@@ -26,7 +26,7 @@ from .step import Received, Step
 
 __all__ = ["LikelihoodConsensusFilter", "PolynomialBasis"]
 
-_CUT = 1e-10
+_RANK_TOLERANCE = 1e-10
 """Combinations of basis functions that vary less, relatively, are left out of a fit."""
 
 
@@ -176,14 +176,17 @@ class LikelihoodConsensusFilter(ParticleFamily):
             return
         # Each agent weights a copy by its own observations, as any particle filter does.
         own = log_weights.copy()
-        # Particles whose weight is not zero: the logarithm of zero is stored as -1e300.
+        # A fit of functions of the particles, on those whose weight is not zero: the logarithm of
+        # zero is stored as -1e300.
         regression = _LeastSquares(
             self._evaluate_basis(stack[-1]), log_weights > -1e299
         )
+        # The K products of two basis functions, in which the log-likelihoods are approximated
         products = _Products(self.basis, regression.n_functions)
         coefficients = np.zeros((*log_weights.shape[:-1], products.size))
-        for place, group in step.received():
-            self._weight(own, stack, place, group, origin, step)
+        for time_index, group in step.received():
+            self._weight(own, stack, time_index, group, origin, step)
+            # The index of the group's agents in arrays (*runs, A, ...)
             rows = group.rows
             # log p(y | x) of each agent's own observations, but for a constant
             logs = own[..., rows, :] - log_weights[..., rows, :]
@@ -217,6 +220,7 @@ class LikelihoodConsensusFilter(ParticleFamily):
 
     def _evaluate_basis(self, members: Array) -> Array:
         """Return the basis functions at all particles (*runs, A, N, d), (*runs, A, N, P)."""
+        # A copy, since the user's function may work in place
         values = call_user(self.basis, members.copy())
         values = check_array(values, "basis", (*members.shape[:-1], "P"))
         n_functions = values.shape[-1]
@@ -250,7 +254,7 @@ class _LeastSquares:
 
     def fit(self, values: Array) -> Array:
         """Return the coefficients of values (..., N, m), of the constant first, (..., P + 1, m)."""
-        # The constant is fitted by taking all relative to the mean over the particles.
+        # The constant is fitted by taking all relative to the mean over the particles that count.
         weights = self.is_alive / self.is_alive.sum(axis=-1, keepdims=True)
         mean = weights[..., None, :] @ self.functions
         alive = self.is_alive[..., None]
@@ -260,7 +264,7 @@ class _LeastSquares:
         spread = np.where(spread > 0, spread, 1.0)
         mean_value = weights[..., None, :] @ np.where(alive, values, 0.0)
         target = np.where(alive, values - mean_value, 0.0)
-        inverse = np.linalg.pinv(centred / spread, rcond=_CUT)
+        inverse = np.linalg.pinv(centred / spread, rcond=_RANK_TOLERANCE)
         slopes = (inverse @ target) / spread.mT
         return np.concatenate([mean_value - mean @ slopes, slopes], axis=-2)
 
@@ -278,9 +282,11 @@ class _Products:
     """
 
     def __init__(self, basis: Callable[[Array], Array], n_functions: int) -> None:
+        # The numbers of the two functions of each pair, but for the first pair, 1 times 1
         first, second = np.triu_indices(n_functions + 1)
         self.first = first[1:]
         self.second = second[1:]
+        # Which product each pair is; pairs of equal monomials share one
         labels = np.arange(self.first.size)
         if isinstance(basis, PolynomialBasis):
             # x^a x^b = x^(a + b)
@@ -291,7 +297,7 @@ class _Products:
         labels = labels.ravel()
         self.labels: Indices = labels
         self.size = int(labels.max()) + 1
-        # One pair of each product
+        # A pair for each product, by which it is computed
         _distinct, self.pairs = np.unique(labels, return_index=True)
 
     def evaluate(self, functions: Array) -> Array:
@@ -303,6 +309,7 @@ class _Products:
 
     def expand_squares(self, coefficients: Array) -> Array:
         """Return those of -½ Σ (c' φ)² for coefficients (..., P + 1, m) of functions, (..., K)."""
+        # The matrix -½ Σ_m c_m c_mᵀ of the quadratic form in 1, φ_1, ..., φ_P
         matrix = -0.5 * coefficients @ coefficients.mT
         # A product of two different functions appears twice in the quadratic form.
         pairs = matrix[..., self.first, self.second]
@@ -312,12 +319,13 @@ class _Products:
     def expand_functions(self, coefficients: Array) -> Array:
         """Return the coefficients of c' φ for those (..., P + 1) of functions, (..., K)."""
         pairs = np.zeros((*coefficients.shape[:-1], self.first.size))
-        # The products with the constant are the functions themselves.
+        # The products with the constant, function 0, are the functions themselves, in their order.
         pairs[..., self.first == 0] = coefficients[..., 1:]
         return self._collect(pairs)
 
     def _collect(self, pairs: Array) -> Array:
-        """Add up the coefficients of pairs that have the same product."""
+        """Add up the coefficients of pairs that have the same product, (..., K)."""
+        # Whether a pair has a product, (pairs, K)
         is_product = self.labels[:, None] == np.arange(self.size)
         return np.asarray(pairs @ is_product)
 
@@ -325,11 +333,14 @@ class _Products:
 def _whiten(group: Received, members: Array) -> Array:
     """Return residuals of all particles in units of the noise, (*runs, G, N, M).
 
-    Missing numbers have none; what a particle cannot predict is NaN.
+    The group's G agents have M observed numbers each, and members (*runs, G, N, d). A missing
+    number has a residual of zero; what a particle cannot predict is NaN.
     """
+    # Each predicted angle is brought within half a period of the observed one.
     predicted = group.predict(members, branch="each")
-    # L⁻¹ (y - h(x)) with R = L Lᵀ; a missing number has a unit variance of its own. So has that
-    # of a sensor that is a likelihood, which has no variance.
+    # L⁻¹ (y - h(x)) with R = L Lᵀ. Row and column of a missing number in R, (M, M) or (G, M, M),
+    # become those of the identity, and so do those of a sensor that is a likelihood, whose
+    # variance is zero.
     variance = np.diagonal(group.noise, axis1=-2, axis2=-1)
     missing = np.isnan(group.target) | (variance == 0)
     is_pair = ~missing[..., :, None] & ~missing[..., None, :]
@@ -351,14 +362,17 @@ def _approximate(
     A Gaussian log-likelihood is -½ |r|² of the whitened residuals r: these are fitted by the basis
     functions, so that the squares are exact if the sensor is. Others are fitted directly.
     """
+    # The particles that have a weight, (*runs, G, N)
     alive = regression.is_alive
     # Whether the log-likelihoods are -½ |r|², but for a constant
     exact = -0.5 * (whitened**2).sum(axis=-1)
     difference = np.where(alive, logs - exact, 0.0)
     largest = np.where(alive, np.abs(exact), 0.0).max(axis=-1)
+    # The range of the difference over the particles
     span = difference.max(axis=-1, where=alive, initial=-np.inf)
     span = span - difference.min(axis=-1, where=alive, initial=np.inf)
-    # They are if the difference is the same for all particles, up to rounding.
+    # They are if the difference is the same for all particles, up to rounding, and no observation
+    # is impossible for one of them.
     is_gaussian = span <= 1e-9 * (1 + largest)
     is_gaussian &= (is_possible | ~alive).all(axis=-1)
     squares = products.expand_squares(regression.fit(np.nan_to_num(whitened)))

@@ -119,6 +119,7 @@ class TargetMixtureFilter(
         mixtures = prior_mixtures(
             prior, self.model.dim, self.n_agents, periods=self.periods
         )
+        # Angles of the components near each other, with their mean in [-period/2, period/2)
         settled = [settle_mixture(mixture, self.periods) for mixture in mixtures]
         return {"mixtures": tuple(settled)}
 
@@ -136,13 +137,15 @@ class TargetMixtureFilter(
 
     def _reduce(self, belief: GaussianMixture) -> GaussianMixture:
         """Merge components until `n_components` are left."""
+        # Angles near each other before the merger, with their mean in [-period/2, period/2)
         belief = settle_mixture(belief, self.periods)
         # Of many components only pairs with the heaviest are candidates.
         n_pairs = max(_MAX_ALL_PAIRS, self.n_components)
         reduced = runnalls(belief, self.n_components, heaviest=n_pairs)
-        # A merger may lie beyond half a period.
+        # The mean of merged angles may lie beyond half a period.
         reduced = settle_mixture(reduced, self.periods)
-        # A copy without the Cholesky factors that it came with: a loaded state has none.
+        # A copy without the cached Cholesky factors, which a state loaded from a file does not have
+        # either: the next step computes the same from both.
         return reduced.replace()
 
     def summarize(self, state: MixtureState) -> Summary:
@@ -165,7 +168,7 @@ class TargetMixtureFilter(
     ) -> list[GaussianMixture]:
         """Forecast all agents' beliefs: in one call, unless components are split."""
         if self.split_threshold is None and step.dt:
-            # An error comes again below, where it names its agent.
+            # After an error the agents are forecast one by one below, where it names its agent.
             with suppress(*RECOVERABLE):
                 return propagate_together(beliefs, *self._motion(step))
         return [
@@ -178,6 +181,7 @@ class TargetMixtureFilter(
         """Return the function that moves points in a step, and the factor of its noise."""
         t = step.state.t
         noise_sqrt = self.model.noise_sqrt(t, step.dt)
+        # With angles, points must not be torn apart by a wrap, or a warning must say so.
         if self.periods or self.notices_wrapping:
             return partial(self._step_points, step), noise_sqrt
         return partial(self.model.step, t=t, dt=step.dt), noise_sqrt
@@ -200,8 +204,11 @@ class TargetMixtureFilter(
         model = self.model
         if dt == 0:
             return belief
+        # An error in the block names the agent.
         with step.failing_as(agent):
             if self.split_threshold is not None:
+                # Components for which the model is most nonlinear are split. Finite differences
+                # take their steps from the belief's standard deviations.
                 std = deviations(belief.cov)
                 belief = split_nonlinear(
                     belief,
@@ -213,7 +220,10 @@ class TargetMixtureFilter(
             return propagate_mixture(belief, *self._motion(step))
 
     def _step_points(self, step: Step[MixtureState], points: Array) -> Array:
-        """Move the components' points (L, N, d) without noise, each component's on one branch."""
+        """Move the components' points (L, N, d) by the model without noise.
+
+        The angles of each component's N points are near each other afterwards.
+        """
         t = step.state.t
         moved = step_members(self.model, points, t, step.dt)
         if self.notices_wrapping:
@@ -229,6 +239,8 @@ class TargetMixtureFilter(
         second: GaussianMixture | None = None,
     ) -> tuple[GaussianMixture, GaussianMixture | None]:
         """Condition an agent's belief, and a second one, on observations that pass its gate.
+
+        The second one is the belief without the information that the agent has still to send.
 
         >>> from distfilt.models import Model
         >>> from distfilt.sensors import component
@@ -251,6 +263,8 @@ class TargetMixtureFilter(
             if self.periods:
                 check_sensor(sensor, self.model, belief.means)
             if sensor.wraps:
+                # Predicts the angles of a component's points without a jump by a period between
+                # them, so that plain differences compare them: `on_branch`
                 predict = partial(predict_points, sensor)
             with step.failing_as(agent):
                 if self.gate_probability is not None:
@@ -269,7 +283,8 @@ class TargetMixtureFilter(
                 belief = update_mixture(
                     belief, *likelihood, residual=residual, on_branch=True
                 )
-                # The same observations count for both, or their difference would hold one.
+                # Both beliefs get the observations, so that the information to be sent, their
+                # difference, does not change.
                 if second is not None:
                     second = update_mixture(
                         second, *likelihood, residual=residual, on_branch=True
@@ -281,7 +296,10 @@ class TargetMixtureFilter(
 
 
 def settle_mixture(mixture: GaussianMixture, periods: Periods) -> GaussianMixture:
-    """Bring a mixture's components onto one branch, with its mean in [-period/2, period/2).
+    """Shift angles of a mixture's means by whole periods, so that they are near each other.
+
+    Each is then within half a period of their circular mean, and the mixture's mean in
+    [-period/2, period/2).
 
     >>> two = GaussianMixture([0.5, 0.5], [[3.1], [-3.1]], [[[0.1]]] * 2)
     >>> settle_mixture(two, (2 * np.pi,)).means.ravel().round(4)
@@ -291,12 +309,13 @@ def settle_mixture(mixture: GaussianMixture, periods: Periods) -> GaussianMixtur
         return mixture
     weights = mixture.weights
     means = settle(fold(mixture.means, periods, weights), periods, weights)
-    # The roots of the covariances, which a mixture may hold in its cache, stay.
+    # The factors of the covariances, which a mixture may have cached, stay valid.
     return mixture if means is mixture.means else _move_means(mixture, means)
 
 
 def _move_means(mixture: GaussianMixture, means: Array) -> GaussianMixture:
-    """Return a mixture with other means, and with the roots of the covariances if it has them."""
+    """Return a mixture with other means, and with the covariances' factors if it has them."""
+    # A cached property is in the instance's dictionary once it has been computed.
     cached = {}
     if "factors" in vars(mixture):
         cached["factors"] = mixture.factors
@@ -307,6 +326,7 @@ def _gate_width(value: Array, probability: float) -> float:
     """Return the gate in standard deviations: the root of the chi-squared quantile."""
     from scipy.special import gammaincinv
 
+    # χ²(m) of the m numbers that are not missing, whose quantile is 2 P⁻¹(m / 2, probability)
     size = (~np.isnan(value)).sum()
     return float(np.sqrt(2 * gammaincinv(size / 2, probability)))
 
@@ -412,7 +432,8 @@ class MixtureFilter(TargetMixtureFilter, FusesBeliefs[MixtureState]):
         # Mixtures have a rule of their own, with a list of them.
         rule = cast(MixtureRule, self.fusion)
         if self.periods:
-            # All agents' means on one branch.
+            # The rule gets agents' means whose angles are near each other, within half a period of
+            # the agents' circular mean.
             settled = [settle_mixture(belief, self.periods) for belief in beliefs]
             common = fold(np.array([belief.mean for belief in settled]), self.periods)
             pairs = zip(settled, common, strict=True)
@@ -430,7 +451,7 @@ class MixtureFilter(TargetMixtureFilter, FusesBeliefs[MixtureState]):
                     f"fusion must return mixtures of dimension {old.dim}, got {new.dim}"
                 )
             with step.failing_as(agent):
-                # Raises a LinAlgError if the fusion has made a covariance singular.
+                # The property factors the covariances: a LinAlgError if one is singular.
                 new.factors  # noqa: B018
             checked.append(new)
         return checked

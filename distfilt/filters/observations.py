@@ -73,6 +73,7 @@ class Observation(FrozenModel):
 def sensor_of(f: SensorFilter[AnyState], observation: Observation) -> Sensor:
     """Return the sensor of an observation: its own, or one of the agent's."""
     if isinstance(observation.sensor, Sensor):
+        # The filter's own sensors have been checked before: a likelihood may not be supported.
         f.check_likelihood(observation.sensor)
         if observation.sensor.uses_previous:
             raise ValueError(
@@ -145,7 +146,7 @@ def list_by_agent(
     Traceback (most recent call last):
     ValueError: observations must be a list with an entry for each of 3 agents, got 2 entries
     """
-    # A table of pandas.
+    # A table of pandas has this method.
     to_numpy = getattr(observations, "to_numpy", None)
     if to_numpy is not None:
         observations = to_numpy()
@@ -173,6 +174,7 @@ def _check_entry(
     f: SensorFilter[AnyState], entry: object, agent: int, t: float, name: str
 ) -> Observation:
     """Return an Observation of this agent and time, or make one of its only sensor's value."""
+    # A value without a time, an agent and a sensor can only be of the agent's only sensor.
     if not isinstance(entry, Observation):
         sensors = f.agent_sensors[agent]
         if len(sensors) != 1:
@@ -224,13 +226,15 @@ def match_delayed(
 
     A sum of steps may differ by rounding, but by far less than the shortest of them.
     """
+    # The earlier times that the step keeps, and the shortest distance of two of them
     times = state.lagged_times(f.lag, t)
     shortest = min((b - a for a, b in pairwise((*times, t))), default=0.0)
     matched = []
     for observation in delayed:
         t_obs = observation.t
         nearest = min(times, key=lambda time: abs(time - t_obs), default=np.inf)
-        # A billionth of the time is far more than rounding.
+        # A billionth of the time is far more than rounding; a thousandth of the shortest step keeps
+        # two times apart.
         tolerance = min(1e-9 * max(1.0, abs(t_obs)), 1e-3 * shortest)
         if abs(nearest - t_obs) > tolerance:
             stored = ", ".join(map(format_number, times)) or "none with lag = 0"

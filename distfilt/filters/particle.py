@@ -100,6 +100,7 @@ class ParticleFamily(MembersFilter[ParticleState]):
     ) -> dict[str, object]:
         """Draw particles for each agent, with equal weights."""
         drawn = self.draw_prior(prior, (*runs, self.n_agents), rng)
+        # Angles are shifted by whole periods: each agent's mean is then in [-period/2, period/2).
         drawn = settle(drawn, self.periods)
         # log(1/N)
         log_weights = np.full(drawn.shape[:-1], -np.log(self.members))
@@ -117,15 +118,17 @@ class ParticleFamily(MembersFilter[ParticleState]):
             once in a run.
         """
         state = step.state
-        # Whole paths are resampled: the stack holds each particle's earlier states too.
+        # Whole paths are resampled: the stack holds each particle's states at the times that are
+        # kept too, the present ones last.
         stack = step.stack(state.particles)
         resampling = self._resample(stack, state, step)
         log_weights = resampling.log_weights
         ancestors = resampling.ancestors
-        # Where each particle comes from: resampling has moved it from its place in the state.
+        # The particles before the forecast; they are not in the state's order after resampling.
         origin = stack[-1]
         if step.dt:
             if self.periods:
+                # A full turn of an angle before the step has to be a full turn after it.
                 check_transition(step.model, origin.mean(axis=-2), state.t, step.dt)
             moved = step.model.sample_step(origin, state.t, step.dt, rng=step.rng)
             stack[-1] = step.check_forecast(moved, origin)
@@ -133,7 +136,8 @@ class ParticleFamily(MembersFilter[ParticleState]):
                 warn_of_wrapping(step.model, origin, moved, state.t, step.dt)
         self._assimilate(log_weights, stack, origin, step)
         if self.periods:
-            # Moments and fusion need one branch: that about the weighted particles' direction.
+            # Moments and fusion need angles near each other: within half a period of their
+            # weighted circular mean.
             weights = np.exp(log_weights)
             stack = [fold(paths, self.periods, weights) for paths in stack]
         past, fused = self._fuse(log_weights, stack, ancestors, step)
@@ -157,12 +161,12 @@ class ParticleFamily(MembersFilter[ParticleState]):
     ) -> None:
         """Multiply the weights by the likelihoods of the observations, in place.
 
-        The stack has the particles of the times that are kept, oldest first, and of now; `origin`
-        has those with which the step began.
+        The stack has the particles (*runs, A, N, d) of the times that are kept, oldest first, and
+        of now; `origin` has those with which the step began, after resampling.
         """
         # An observation of a kept time is compared with the particles of that time.
-        for place, group in step.received():
-            self._weight(log_weights, stack, place, group, origin, step)
+        for time_index, group in step.received():
+            self._weight(log_weights, stack, time_index, group, origin, step)
 
     def _fuse(
         self,
@@ -177,9 +181,10 @@ class ParticleFamily(MembersFilter[ParticleState]):
         # A fusion rule moves an ensemble, so the particles need equal weights: all agents resample,
         # each with one uniform number.
         offset = step.rng.random((*log_weights.shape[:-1], 1))
-        everybody = np.ones(log_weights.shape[:-1], bool)
+        all_agents = np.ones(log_weights.shape[:-1], bool)
         weights = np.exp(log_weights)
-        self._select(stack, log_weights, weights, everybody, offset, ancestors)
+        # The stack, log-weights and ancestors are changed in place.
+        self._select(stack, log_weights, weights, all_agents, offset, ancestors)
         fused = fuse_members(step, stack[-1])
         # The fusion moves the present particles; the earlier ones follow by regression.
         return regress_past(stack, fused), fused
@@ -203,30 +208,35 @@ class ParticleFamily(MembersFilter[ParticleState]):
         self,
         log_weights: Array,
         stack: list[Array],
-        place: int,
+        time_index: int,
         group: Received,
         origin: Array,
         step: Step[ParticleState],
     ) -> None:
-        """Multiply a group's weights by the likelihood of its observations, in place."""
+        """Multiply a group's weights by the likelihood of its observations, in place.
+
+        The observations are of the time with the index `time_index` in the stack.
+        """
+        # The index of the group's agents in arrays (*runs, A, ...)
         rows = group.rows
+        # The earlier particles with which a sensor of changes compares
         previous = None
         if group.changes:
-            previous = step.before(place, group, stack[:-1], origin)
-        members = stack[place][..., rows, :, :]
+            previous = step.find_previous(time_index, group, stack[:-1], origin)
+        members = stack[time_index][..., rows, :, :]
         predicted = group.predict(members, previous, branch="each")
         if not all_finite(predicted):
             # A particle that cannot see contradicts what was seen, unless none can.
             is_unseen = np.asarray(np.isnan(predicted).all(axis=-2))
             step.note_unseen(group, is_unseen, "no particle can see")
-        # log w' = log w + log p(y | x), normalised; the gate weighs by the old weights.
+        # log w' = log w + log p(y | x), normalised. The gate predicts with the old weights.
         old = log_weights[..., rows, :]
         group = step.gate(
             group,
             _moments_by_logs,
             predicted,
             old,
-            is_torn=True,
+            near_observed=True,
             is_gaussian=False,
             weighted=(members, np.exp(old)) if group.likelihoods else None,
         )
@@ -234,7 +244,8 @@ class ParticleFamily(MembersFilter[ParticleState]):
         group, likelihoods = group.log_likelihood(members)
         prior = old + likelihoods
         if step.scores:
-            # log Σ wᵢ p(y | xᵢ)
+            # log Σ wᵢ p(y | xᵢ); a particle without a prediction counts as one that contradicts.
+            # The normaliser is what the log-likelihood leaves out, as it is the same for all.
             joint = prior + particles.log_likelihood(
                 predicted, group.target, group.noise, contradict=True
             )
@@ -242,6 +253,8 @@ class ParticleFamily(MembersFilter[ParticleState]):
             total = log_sum_exp(joint)[..., 0] + normalizer
             step.add_log_likelihood(total, group.agents)
 
+        # Predictions h, observations y and log-weights, then what `apply` adds: the noise that all
+        # rows share, and a generator.
         def compute(
             h: Array, y: Array, logs: Array, noise: Array, _rng: object
         ) -> tuple[Array]:
@@ -293,7 +306,7 @@ class ParticleFamily(MembersFilter[ParticleState]):
         # The present particles; before them the stack holds those of earlier times.
         before = stack[-1]
         # Every agent draws, also if it does not resample: its numbers must not depend on
-        # another's weights.
+        # another's weights. A systematic resampling needs one uniform number.
         offset = step.rng.random((*log_weights.shape[:-1], 1))
         bandwidth = self._bandwidth(state.t, step.dt)
         noise = step.rng.standard_normal(before.shape) if bandwidth else None
@@ -302,20 +315,22 @@ class ParticleFamily(MembersFilter[ParticleState]):
         if not np.count_nonzero(is_due):
             return _Resampling(log_weights, ancestors)
         is_tested = is_due & self._has_few_ancestors(ancestors)
+        # Weights of failed runs mean nothing.
         is_tested[state.failed] = False
         if noise is None and not np.count_nonzero(is_tested):
             # The usual case: no copies to separate, no families to look into.
             self._select(stack, log_weights, state.weights, is_due, offset, ancestors)
             return _Resampling(log_weights, ancestors)
         # An agent's particles have to be worth so many independent ones: a fiftieth of them, within
-        # the bounds `_FEWEST` and `_ENOUGH`.
-        least = min(max(_FEWEST, 0.02 * self.members), _ENOUGH)
+        # the bounds `_MIN_WORTH` and `_SUFFICIENT_WORTH`.
+        least = min(max(_MIN_WORTH, 0.02 * self.members), _SUFFICIENT_WORTH)
         # How many they are worth, and which share of their variance lies within families; infinity
         # and one for agents that are not tested.
         worths, shares_within = measure_families(
             before, state.weights, ancestors, is_tested, least
         )
-        # A family that is as wide as the families lie apart is no clone of one particle any more.
+        # Where half of the variance lies within families, these are as wide as they lie apart, and
+        # no clones of one particle any more.
         is_renewed = is_tested & (shares_within > 0.5)
         is_collapsed = worths < least
         counts = self._select(
@@ -353,11 +368,17 @@ class ParticleFamily(MembersFilter[ParticleState]):
         noise: Array,
         bandwidth: float,
     ) -> Array:
-        """Add noise to copies in units of the weighted spread before the resampling."""
+        """Add noise to copies in units of the weighted spread before the resampling.
+
+        The arrays are those of the K agents that have resampled: the particles after and `before`
+        it, (K, N, d), their former weights, (K, N), and how often each was taken, which has K N
+        numbers too.
+        """
         # Where one weight dominates, the weighted spread is gone; all particles' is used.
         is_degenerate = particles.effective_size_of(weights)[:, None] < 2
         weights = np.where(is_degenerate, 1 / self.members, weights)
         _mean, cov = compute_moments(before, weights)
+        # Of each particle after the resampling: whether it is one of several copies
         is_copied = (counts > 1)[..., None]
         copied = particles.repeat_by_count(is_copied, counts)
         return particles.add_jitter(
@@ -365,8 +386,9 @@ class ParticleFamily(MembersFilter[ParticleState]):
         )
 
     def _has_few_ancestors(self, ancestors: Indices) -> Mask:
-        """Whether less than a tenth of an agent's particles are ancestors of all."""
-        # Resampling keeps the order, so descendants of one ancestor stand together.
+        """Whether all particles of an agent descend from less than a tenth of their number."""
+        # Resampling keeps the order, so descendants of one ancestor are neighbours, and a family
+        # begins where the ancestor changes.
         n_families = 1 + (ancestors[..., 1:] != ancestors[..., :-1]).sum(axis=-1)
         return np.asarray(n_families < 0.1 * self.members)
 
@@ -392,8 +414,11 @@ class ParticleFamily(MembersFilter[ParticleState]):
     ) -> Indices:
         """Resample some agents' paths in the stack and their ancestors; weights are equal then.
 
+        `agents` (*runs, A) is true for those that resample, and `offset` (*runs, A, 1) is each
+        one's uniform number. The stack, the log-weights and the ancestors are changed in place.
         Returns how often each particle was taken.
         """
+        # All agents as a slice, which need not be copied
         rows: slice | Mask = slice(None) if agents.all() else agents
         counts = particles.systematic_counts(weights[rows], offset[rows])
         for k, path in enumerate(stack):
@@ -403,8 +428,10 @@ class ParticleFamily(MembersFilter[ParticleState]):
                 stack[k][rows] = taken
             else:
                 stack[k] = taken
-        labels = np.repeat(ancestors[rows].reshape(-1), counts.reshape(-1))
-        ancestors[rows] = labels.reshape(counts.shape)
+        # A copy has the ancestor of its original. An agent's counts add up to N, so that the flat
+        # list falls back into rows.
+        descents = np.repeat(ancestors[rows].reshape(-1), counts.reshape(-1))
+        ancestors[rows] = descents.reshape(counts.shape)
         # After resampling every particle has the weight 1/N.
         log_weights[rows] = -np.log(self.members)
         return counts
@@ -420,12 +447,13 @@ class ParticleFamily(MembersFilter[ParticleState]):
 
         `worth` is the least number of independent particles that an agent's are worth.
         """
+        # The effective sample sizes 1 / Σ w², of the runs that have not failed
         size = particles.effective_size_of(np.exp(log_weights))
         if np.count_nonzero(step.failed):
             points = points[~step.failed]
             size = size[~step.failed]
         smallest_size = size.min(initial=np.inf)
-        # Less than a hundredth, or a single one
+        # A hundredth of all, or two: fewer distinct ones are a collapse.
         fewest = max(0.01 * self.members, 2.0)
         n_distinct = self._count_distinct(points, fewest)
         if n_distinct < fewest:
@@ -437,7 +465,8 @@ class ParticleFamily(MembersFilter[ParticleState]):
             problem = (
                 f"an agent's weights have an effective size of {smallest_size:.1f}"
             )
-        elif worth < 0.5 * _FEWEST:
+        # Fewer than five independent particles, half of those below which copies are jittered
+        elif worth < 0.5 * _MIN_WORTH:
             kind = "ancestors"
             problem = (
                 f"an agent's particles are worth {worth:.1f}: they descend from few, and "
@@ -451,9 +480,12 @@ class ParticleFamily(MembersFilter[ParticleState]):
         step.warn_once(f"collapse of {kind}", text, particles.ParticleCollapse)
 
     def _count_distinct(self, points: Array, fewest: float) -> float:
-        """Return a lower bound of each agent's number of distinct particles, above `fewest`."""
-        # A sample whose first components differ is enough. Only if they do not, e.g. because a
-        # component is known, all particles are compared.
+        """Return a lower bound of the smallest number of distinct particles of an agent.
+
+        It is exact if it is below `fewest`.
+        """
+        # A sample of about four times `fewest` particles whose first components differ is enough.
+        # Only if they do not, e.g. because a component is known, all particles are compared.
         stride = max(1, self.members // (4 * math.ceil(fewest)))
         first = np.sort(points[..., ::stride, 0])
         differs = first[..., 1:] > first[..., :-1]
@@ -515,18 +547,18 @@ class ParticleFilter(
 
 
 _TINY = np.finfo(float).tiny
-_FEWEST = 10.0
+_MIN_WORTH = 10.0
 """Copies are jittered if the particles are worth fewer independent ones, or less than a fiftieth of
-their number; below half of `_FEWEST`, a warning is given."""
-_ENOUGH = 40.0
+their number; below half of `_MIN_WORTH`, a warning is given."""
+_SUFFICIENT_WORTH = 40.0
 """No jitter if the particles are worth so many: the mean's error then adds 1/40 to its variance."""
 
 
 class _Resampling(NamedTuple):
     """Log-weights after a resampling, and each particle's ancestor, (*runs, A, N).
 
-    `worth` is the number of independent particles that the least of the looked-at agents' families
-    were worth; infinite if none had to be looked at.
+    `worth` is the smallest number of independent particles that the families of a tested agent
+    were worth; infinite if none had to be tested.
     """
 
     log_weights: Array
@@ -539,6 +571,7 @@ def _draw_separately(rng: Rng, shape: tuple[int, ...]) -> Array:
 
     Draws that only some steps need do not change those of the other agents and steps.
     """
+    # Four words of 64 bits as a seed
     words = copy_rng(rng).bit_generator.random_raw(4).tolist()
     return np.random.default_rng(words).standard_normal(shape)
 
@@ -580,10 +613,11 @@ def measure_families(
         x = np.ascontiguousarray(points[index].T)
         w = weights[index]
         labels = ancestors[index]
-        # Descendants of one ancestor stand together.
+        # Descendants of one ancestor are neighbours: a family starts where the ancestor changes.
         is_start = np.ones(labels.size, dtype=bool)
         np.not_equal(labels[1:], labels[:-1], out=is_start[1:])
         starts = np.flatnonzero(is_start)
+        # The weights of the families, and their effective number
         mass = np.add.reduceat(w, starts)
         n_families = 1 / (mass**2).sum()
         if n_families >= least:
@@ -595,6 +629,7 @@ def measure_families(
         positive = np.maximum(mass, _TINY)
         means = np.add.reduceat(weighted, starts, axis=-1) / positive
         mean = weighted.sum(axis=-1)
+        # The number of families that have begun is the number of each member's family, from 1.
         within = (x - means[:, is_start.cumsum() - 1]) ** 2 @ w
         total = (x - mean[:, None]) ** 2 @ w
         # A component that is known has no variance but rounding.
@@ -624,6 +659,7 @@ def select_visible(predicted: Array, weights: Array) -> tuple[Array, Array]:
     is_visible = np.asarray(~np.isnan(predicted).any(axis=-1))
     weights = np.where(is_visible, weights, 0.0)
     total = weights.sum(axis=-1, keepdims=True)
+    # Divided by NaN in place of zero where no point can see
     weights = weights / np.where(total > 0, total, np.nan)
     return np.where(is_visible[..., None], predicted, 0.0), weights
 

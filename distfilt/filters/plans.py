@@ -82,36 +82,37 @@ def plan_steps(
     >>> times, [[float(o.value[0]) for o in e.observations[0]] for e in entries]
     (array([0.5, 1. ]), [[3.0], [2.0, 1.0]])
     """
-    # With events the grid may be empty: their own times are enough.
-    grid = np.zeros(0) if times is None else check_array(times, "times", ("T",))
-    check_increasing(grid, "times")
-    # An empty list has no entry for any agent, so it can only be one without events.
+    # With events no other times are needed: each of them is a step.
+    step_times = np.zeros(0) if times is None else check_array(times, "times", ("T",))
+    check_increasing(step_times, "times")
+    # An empty list has no entry for any agent, so it can only be a list without events.
     if are_observations(observations):
-        grid, entries = _plan_events(f, state, grid, observations)
+        step_times, entries = _plan_events(f, state, step_times, observations)
     elif times is None:
         raise ValueError(
             "times must be an array unless all observations are Observations, got None"
         )
     else:
-        entries = _plan_series(f, state, grid, observations)
-    if grid.size and grid[0] < state.t:
+        entries = _plan_series(f, state, step_times, observations)
+    if step_times.size and step_times[0] < state.t:
         raise ValueError(
             f"times must start at the state's time {format_number(state.t)} or later, got "
-            f"{format_number(grid[0])}"
+            f"{format_number(step_times[0])}"
         )
-    warn_of_clock(state.t, grid, "times")
-    return grid, entries
+    warn_of_clock(state.t, step_times, "times")
+    return step_times, entries
 
 
 def _plan_events(
     f: Filter[AnyState],
     state: AnyState,
-    grid: Array,
+    step_times: Array,
     events: Sequence[Observation],
 ) -> tuple[Array, Iterator[StepObservations]]:
-    """Sort events by time; there is a step at each time of the grid and of an event."""
+    """Sort events by time; there is a step at each of the user's times and at each event's."""
+    # For each time a list of each agent's events
     by_time: dict[float, list[list[Observation]]] = {}
-    for t in grid:
+    for t in step_times:
         by_time[t] = [[] for _ in range(f.n_agents)]
     for event in events:
         if event.agent >= f.n_agents:
@@ -122,14 +123,16 @@ def _plan_events(
         if event.t not in by_time:
             by_time[event.t] = [[] for _ in range(f.n_agents)]
         by_time[event.t][event.agent].append(event)
-    wild = find_degrees(_sensors_of(f), events)
-    if wild is not None:
-        warnings.warn(wild, RuntimeWarning, stacklevel=5)
+    degrees = find_degrees(_sensors_of(f), events)
+    if degrees is not None:
+        # The warning names a line five frames up, near the user's call.
+        warnings.warn(degrees, RuntimeWarning, stacklevel=5)
     times = sorted(by_time)
     near = _find_near_copies(state.t, times, by_time)
     if near is not None:
         warnings.warn(near, RuntimeWarning, stacklevel=5)
-    # What does not fit is looked at again, and refused or completed, in its step.
+    # The times with an event that does not fit its sensor: it is refused or completed in its step.
+    # A family that reads observations in its own way does so in each step.
     unread = {*times}
     if f.reads_by_default:
         unread = {e.t for e in _find_unfit(_sensors_of(f), _runs_of(state), events)}
@@ -137,7 +140,7 @@ def _plan_events(
     return np.array(times), iter(entries)
 
 
-_NEAR = 1e-3
+_NEAR_FRACTION = 1e-3
 """Copies of an event have times that differ by less than this part of the usual step."""
 
 
@@ -151,9 +154,11 @@ def _find_near_copies(
     "observations must have one time to count once, got the same value of agent 0's sensor ..."
     """
     for k in _find_near_times(start, np.array(times)):
+        # Each agent's events at this time and at the next
         pairs = zip(by_time[times[k]], by_time[times[k + 1]], strict=True)
         for before, after in pairs:
             for one, other in product(before, after):
+                # Numbers are compared, and sensors that come with their observations
                 if one.sensor is not other.sensor and one.sensor != other.sensor:
                     continue
                 if is_equal_value(one.value, other.value):
@@ -162,17 +167,19 @@ def _find_near_copies(
 
 
 def _find_near_times(start: float, times: Array) -> list[int]:
-    """Return the places of times after which the next one follows much sooner than usual.
+    """Return the indices of times after which the next one follows much sooner than usual.
 
     >>> _find_near_times(0.0, np.array([1.0, 1.0 + 1e-9, 2.0, 3.0]))
     [0]
     """
     if len(times) < 2:
         return []
+    # The lengths of the steps, from the state's time on
     gaps = np.diff(times, prepend=start)
     usual = float(np.median(gaps))
-    places: list[int] = np.flatnonzero(gaps[1:] < _NEAR * usual).tolist()
-    return places
+    # The first gap is that from the state to times[0]; gaps[1:] follow times[0], times[1], …
+    indices: list[int] = np.flatnonzero(gaps[1:] < _NEAR_FRACTION * usual).tolist()
+    return indices
 
 
 def _find_unfit(
@@ -185,7 +192,7 @@ def _find_unfit(
         number = event.sensor
         sensors = agent_sensors[event.agent]
         expected: tuple[int, ...] | None = None
-        # One that arrives later is looked at again.
+        # One that arrives later fits no step of a plan, so that no shape is expected of it.
         is_punctual = event.arrival_time is None
         if is_punctual and isinstance(number, int) and number < len(sensors):
             expected = (*runs, sensors[number].dim)
@@ -194,7 +201,7 @@ def _find_unfit(
         else:
             fitting.setdefault(event.value.size, []).append(event)
     for same_size in fitting.values():
-        # All values of one size at once
+        # All values of one size at once, a row for each event
         values = np.array([event.value.ravel() for event in same_size])
         is_finite = np.isfinite(values).all(axis=1).tolist()
         pairs = zip(same_size, is_finite, strict=True)
@@ -209,11 +216,11 @@ def _runs_of(state: AnyState) -> tuple[int, ...]:
 
 
 def _plan_series(
-    f: Filter[AnyState], state: AnyState, grid: Array, observations: object
+    f: Filter[AnyState], state: AnyState, step_times: Array, observations: object
 ) -> Iterator[StepObservations]:
     """Take each agent's series (T, ...) apart into times."""
     series_by_agent: list[Series | None] = []
-    _refuse_ambiguous(observations, f.n_agents, grid.size)
+    _refuse_ambiguous(observations, f.n_agents, step_times.size)
     for series in list_by_agent(observations, f.n_agents):
         if series is None or isinstance(series, list | tuple):
             series_by_agent.append(series)
@@ -229,40 +236,43 @@ def _plan_series(
             series_by_agent.append(np.atleast_1d(np.asarray(series)))
     sensors = _sensors_of(f)
     for agent, series in enumerate(series_by_agent):
-        if series is not None and len(series) != grid.size:
+        if series is not None and len(series) != step_times.size:
             raise ValueError(
-                f"observations must have shape ({grid.size}, ..., m) for agent {agent}, "
+                f"observations must have shape ({step_times.size}, ..., m) for agent {agent}, "
                 f"got length {len(series)}"
             )
         if isinstance(series, np.ndarray) and sensors:
             _check_series(sensors[agent], series, agent)
         if series is not None and sensors:
             _warn_of_degrees(sensors, series, agent)
-    near = _find_near_rows(_find_near_times(state.t, grid), grid, series_by_agent)
+    near = _find_near_rows(
+        _find_near_times(state.t, step_times), step_times, series_by_agent
+    )
     if near is not None:
         warnings.warn(near, RuntimeWarning, stacklevel=5)
     shapes: list[tuple[int, ...] | None] = []
     if f.reads_by_default:
-        lead = (grid.size, *_runs_of(state))
+        lead = (step_times.size, *_runs_of(state))
+        # Each agent's array of values, if it has one sensor
         shapes = [(*lead, s[0].dim) if len(s) == 1 else None for s in sensors]
-    return _list_rows(grid, series_by_agent, shapes)
+    return _list_rows(step_times, series_by_agent, shapes)
 
 
 def _find_near_rows(
-    places: list[int], grid: Array, series_by_agent: list[Series | None]
+    indices: list[int], step_times: Array, series_by_agent: list[Series | None]
 ) -> str | None:
     """Return a warning of rows that are the same as the next but for rounding of their time.
 
-    `places` are those of times that the next one follows much sooner than usual.
+    `indices` are those of times that the next one follows much sooner than usual.
     """
     for agent, series in enumerate(series_by_agent):
-        # Sensors that are named with their values are found among the step's Observations.
+        # A list of Observations is left to the single steps, which compare sensors too.
         if not isinstance(series, np.ndarray) or series.dtype.kind != "f":
             continue
-        for k in places:
+        for k in indices:
             is_seen = not np.isnan(series[k]).all()
             if is_seen and is_equal_value(series[k], series[k + 1]):
-                return describe_near_copy(agent, grid[k], grid[k + 1])
+                return describe_near_copy(agent, step_times[k], step_times[k + 1])
     return None
 
 
@@ -272,6 +282,7 @@ def _refuse_ambiguous(observations: object, n_agents: int, n_times: int) -> None
     if (
         n_agents > 1
         and len(shape) > 2
+        # The first two axes, and the same in reverse order
         and shape[:2] == (n_agents, n_times) == shape[1::-1]
     ):
         raise ValueError(
@@ -281,16 +292,27 @@ def _refuse_ambiguous(observations: object, n_agents: int, n_times: int) -> None
 
 
 def _list_rows(
-    grid: Array,
+    step_times: Array,
     series_by_agent: list[Series | None],
     shapes: list[tuple[int, ...] | None],
 ) -> Iterator[StepObservations]:
-    """Yield the rows of all agents' series time by time.
+    """Yield the observations of all agents, taken from their series, time by time.
 
-    Arrays of these shapes are read, where all of their numbers are finite: those of agents with
-    one sensor each.
+    Where every series is a float array of the expected shape, (T, *runs, m), the times at which all
+    numbers are finite need no further check: their rows become Observations here. The others are
+    checked in their step.
+
+    Parameters
+    ----------
+    step_times : ndarray, (T,)
+    series_by_agent : list of (sequence or None)
+        Each agent's observations, with one entry for each time.
+    shapes : list of (tuple or None)
+        The shape expected of each agent's series; None for an agent that has not one sensor. Empty
+        if the family reads observations in its own way.
     """
-    is_read = np.ones(grid.size, dtype=bool)
+    # Whether the observations of a time are read, if the series fit
+    is_read = np.ones(step_times.size, dtype=bool)
     fits = bool(shapes)
     for series, shape in zip(series_by_agent, shapes, strict=bool(shapes)):
         if series is None:
@@ -299,14 +321,15 @@ def _list_rows(
         if not fits or cast(Array, series).dtype != np.float64:
             fits = False
             break
-        # Each time by itself, also where there is none
+        # Whether all numbers of a time are finite; the axes are named, as there may be no time
         finite = np.isfinite(np.asarray(series))
         is_read &= finite.all(axis=tuple(range(1, finite.ndim)))
-    for k, t in enumerate(grid.tolist()):
+    for k, t in enumerate(step_times.tolist()):
         rows = [None if series is None else series[k] for series in series_by_agent]
         if not fits or not is_read[k]:
             yield StepObservations(rows, are_read=False)
             continue
+        # One Observation of each agent's only sensor
         read = [
             [] if row is None else [Observation.construct(t, agent, row)]
             for agent, row in enumerate(rows)
@@ -322,6 +345,7 @@ def _sensors_of(f: Filter[AnyState]) -> SensorLists:
 
 def _check_series(sensors: Sequence[Sensor], series: Array, agent: int) -> None:
     """Refuse a series of numbers without an axis for the components, (T,) for (T, 1)."""
+    # Kinds of numpy's types: float, int, unsigned int; not objects, such as Observations
     if series.ndim == 1 and series.dtype.kind in "fiu" and len(sensors) == 1:
         size = series.size
         raise ValueError(
@@ -343,18 +367,23 @@ def _warn_of_degrees(agent_sensors: SensorLists, series: Series, agent: int) -> 
         entries = _list_entries(sensors, series, agent)
     text = find_degrees(agent_sensors, entries)
     if text is not None:
+        # The warning names a line five frames up, near the user's call.
         warnings.warn(text, RuntimeWarning, stacklevel=5)
 
 
 def _list_entries(
     sensors: Sequence[Sensor], series: Series, agent: int
 ) -> list[Observation]:
-    """Return the entries of a list of times as Observations; what fits no sensor is left out."""
+    """Return the entries of a list of times as Observations; what fits no sensor is left out.
+
+    They serve to look for degrees only, so that their time is of no importance.
+    """
     result: list[Observation] = []
     for entry in series:
         for one in entry if are_observations(entry) else (entry,):
             if isinstance(one, Observation):
                 result.append(one)
+            # An array of floats or integers by the only sensor
             elif one is not None and len(sensors) == 1:
                 value = np.asarray(one)
                 if value.dtype.kind in "fiu" and value.shape[-1:] == (sensors[0].dim,):
@@ -397,7 +426,7 @@ def find_degrees(
     for (agent, sensor), parts in values.items():
         observed = np.concatenate([v.reshape(-1, sensor.dim) for v in parts])
         observed = np.nan_to_num(observed)
-        # Angles below four turns need no closer look.
+        # Angles of less than four turns, 8π = 25 rad, need no closer look.
         large = observed[(np.abs(observed) > 25).any(axis=-1)]
         turns = count_turns(sensor, large) if large.size else 0.0
         if turns > 4:

@@ -60,6 +60,7 @@ def _is_mean_and_cov(prior: object) -> TypeGuard[tuple[ArrayLike, ArrayLike]]:
         raise ValueError("prior must be one for all agents, got a list of (mean, cov)")
     if len(prior) != 2:
         return False
+    # Of a list of two the covariance has one axis more than the mean, two members equally many.
     return isinstance(prior, tuple) or _count_axes(prior[0]) < _count_axes(prior[1])
 
 
@@ -100,7 +101,8 @@ def prior_moments(
     definiteness : {"semidefinite", "definite"}
         The condition that the covariance has to meet.
     periods : tuple
-        The model's periods: members and mixtures are brought onto one branch first.
+        The model's periods: angles of members and mixtures are shifted by whole periods first, so
+        that they are near each other.
 
     Examples
     --------
@@ -143,6 +145,7 @@ def _find_moments(
 ) -> tuple[ArrayLike, ArrayLike]:
     """Return the mean and covariance of a prior, unchecked."""
     if isinstance(prior, GaussianMixture):
+        # Angles within half a period of their circular mean
         means = fold(prior.means, periods, prior.weights)
         return GaussianMixture(prior.weights, means, prior.covs).moments()
     if hasattr(prior, "rvs"):
@@ -159,7 +162,7 @@ def _find_moments(
         raise ValueError(
             f"prior must be (mean, cov), or have a mean and a covariance, got {kind}"
         )
-    # Members: their sample moments.
+    # Members: their sample moments, which need angles that are not cut at the end of a period.
     members = check_array(prior, "prior", ("N", dim))
     if len(members) <= dim:
         raise ValueError(f"prior must have more than {dim} members, got {len(members)}")
@@ -188,6 +191,7 @@ def draw_members(
         # scipy's name of the generator, and this package's.
         keyword = "rng" if isinstance(source, GaussianMixture) else "random_state"
         drawn = source.rvs(math.prod(shape[:-1]), **{keyword: rng})
+        # Draws of one component may come without an axis for it.
         return check_array(drawn.reshape(*shape[:-1], -1), "prior", shape)
     if callable(source):
         source = call_user(source, members, rng=rng, leading=leading)
@@ -222,7 +226,8 @@ def split_by_agent(prior: Prior, dim: int, n_agents: int) -> list[_OnePrior] | N
     if not entries or is_prior_of_all:
         return None
     are_priors = [_is_prior(entry, dim) for entry in entries]
-    # Of [mean, cov] the second alone is an array with two axes: that is one prior for all.
+    # In a list [mean, cov] of arrays only the second has two axes, as members (N, d) have: such a
+    # list is one prior for all.
     are_arrays = all(isinstance(e, np.ndarray) for e in entries)
     if are_arrays and not all(are_priors) or not any(are_priors):
         return None
@@ -282,12 +287,14 @@ def prior_mixtures(
     >>> [mixture.n_components for mixture in prior_mixtures(([0.0], [[1.0]]), 1, 2)]
     [1, 1]
     """
+    # One prior for all agents is that of each.
     priors: list[Any] = split_by_agent(prior, dim, n_agents) or [prior] * n_agents
     mixtures = []
     for one in priors:
         if isinstance(one, GaussianMixture):
             mixture = one
         else:
+            # A component needs a density, and so a definite covariance.
             moments = prior_moments(one, dim, "definite", periods=periods)
             mixture = GaussianMixture.gaussian(*moments)
         if mixture.dim != dim:

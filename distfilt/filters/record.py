@@ -230,7 +230,8 @@ def record_run(
     }
     run = xarray.Dataset(variables, coords=coords)
     # `encoding` is the only place that xarray hands on to copies and selections, and leaves out
-    # of tables and files. The agents and the last mean tell a part of the run from all of it.
+    # of tables and files. By the agents and the last mean `final_state` distinguishes a selection,
+    # which has no final state, from the whole run.
     mean = np.array(series["mean"][-1]) if times.size else None
     run.encoding["final_state"] = collected.last, agents, mean
     return run
@@ -257,7 +258,8 @@ def _collect_series(
 ) -> _Collected:
     """Collect the numbers of a run's states and beliefs.
 
-    Only variables to `keep` are collected, and the variance, which the spread needs.
+    Only variables to `keep` are collected, and the variance, which the spread needs. Small states
+    are summarized in blocks of several times.
     """
     series: dict[str, Array] = {}
     counts = [_read_ledgers([start.ledger])]
@@ -268,6 +270,7 @@ def _collect_series(
         states = [state for state, _belief in block]
         counts.append(_read_ledgers([state.ledger for state in states]))
         last = states[-1]
+        # A single state is summarized as it is, without an axis of times in front.
         is_single = len(block) == 1
         beliefs = [belief for _state, belief in block]
         summary = f.summarize(beliefs[0] if is_single else stack_states(beliefs))
@@ -285,20 +288,23 @@ def _collect_series(
             row |= _score_block(f, summary, known, index)
         if keep is not None:
             row = {name: row[name] for name in row if name in (*keep, "variance")}
+        # The block's values into the arrays of all times
         times = slice(first, first + len(block))
         for name, value in row.items():
             _write_block(
                 series, name, value[None] if is_single else value, times, n_times
             )
         first += len(block)
+    # The counts from before the run to its end, (T + 1, ...)
     totals = {name: np.concatenate([c[name] for c in counts]) for name in counts[0]}
     if not series:
         return _Collected(_read_nothing(f, start, known), totals, last)
-    # Filters that have periods, or lack them, have a model of motion.
+    # `lacks_periods`: angles are observed, and none is declared circular in the model. Then a truth
+    # that wraps beside an estimate that does not gives wrong scores.
     if known is not None and getattr(f, "lacks_periods", False):
         model = cast("SensorFilter[State]", f).model
         warn_of_wrapped_truth(model, series["mean"], known.values)
-    # sqrt(tr P); NaN fills agents' missing components, and failed runs are NaN altogether.
+    # √(tr P). A component that an agent lacks is NaN and counts as zero; failed runs are NaN.
     variance = series["variance"]
     spread = np.sqrt(np.nansum(variance, axis=-1))
     is_missing = np.isnan(variance).all(axis=-1)
@@ -309,14 +315,16 @@ def _collect_series(
 def _write_block(
     series: dict[str, Array], name: str, values: Array, times: slice, n_times: int
 ) -> None:
-    """Write the values of some times, (block, ...), into the array of all times, (T, ...).
+    """Write the values of some times, (B, ...), into the array of all times, (T, ...).
 
-    Made when the first block is known, each array is filled in place: a long record is not copied.
+    The array is made with the first block, which shows its shape, and then filled in place: a long
+    record is not copied.
     """
     if name not in series:
         series[name] = np.empty((n_times, *values.shape[1:]), values.dtype)
     elif values.dtype != series[name].dtype:
-        # Whole numbers so far, and fractions from now on
+        # The type that holds both, for instance if there were whole numbers so far, and fractions
+        # from now on
         common = np.result_type(values, series[name])
         series[name] = series[name].astype(common)
     series[name][times] = values
@@ -324,7 +332,7 @@ def _write_block(
 
 def _read_ledgers(ledgers: list[Ledger]) -> dict[str, Array]:
     """Return the counts of ledgers, one after the other, by field."""
-    # Where nobody sends, the ledger stays the same object.
+    # Where nobody sends, the ledger stays the same object: it is read once, and repeated.
     repeats = 1
     if len(ledgers) > 1 and all(ledger is ledgers[0] for ledger in ledgers):
         repeats = len(ledgers)
@@ -339,22 +347,28 @@ def _read_ledgers(ledgers: list[Ledger]) -> dict[str, Array]:
 def _score_block(
     f: Filter[AnyState], summary: Summary, known: _KnownTruth, index: int | slice
 ) -> dict[str, Array]:
-    """Return the scores of a summary of the times with this index."""
+    """Return the scores of a summary of the times with this index in the run."""
     values = known.values[index]
     if f.periods:
-        # A truth that wraps and one that runs on are the same.
+        # Angles that differ by whole periods are the same: each is brought within half a period of
+        # its estimate.
         values = np.broadcast_to(values, summary.mean.shape)
         values = align(values, summary.mean, f.periods)
     return _score(summary, values, known)
 
 
 def _read_unseen(states: Sequence[SensorState], n_agents: int) -> Array:
-    """Return how many observations each agent has left out in each step, (T, *runs, A)."""
+    """Return how many observations each agent could not use in each step, (T, *runs, A).
+
+    They are those that its sensor cannot see from its belief; a state has None if there were none.
+    """
+    # Which runs had failed, (T, *runs)
     failed = np.array([state.failed for state in states])
     result = np.zeros((*failed.shape, n_agents))
-    for numbers, state in zip(result, states, strict=True):
+    for of_time, state in zip(result, states, strict=True):
         if state.unseen is not None:
-            numbers[...] = state.unseen
+            # A view of the result
+            of_time[...] = state.unseen
     # A failed run has no numbers.
     result[failed] = np.nan
     return result
@@ -365,7 +379,11 @@ def _read_nothing(
     start: AnyState,
     known: _KnownTruth | None,
 ) -> dict[str, Array]:
-    """Return the arrays of a record without a single time, (0, ...) each."""
+    """Return the arrays of a record without a single time, (0, ...) each.
+
+    They have the names, shapes and types that a run would have: those of the state at its start,
+    with a first axis of times from which nothing is taken.
+    """
     summary = f.summarize(start)
     row = _read_summary(summary)
     row["spread"] = np.sqrt(np.nansum(summary.variance, axis=-1))
@@ -375,9 +393,11 @@ def _read_nothing(
     if f.gate_probability is not None:
         row["rejected"] = np.zeros(lead)
     if f.record_evidence:
+        # The fields but the first, `rejected`
         for name in _STEP_FIELDS[1:]:
             row[name] = np.zeros(lead)
     if known is not None:
+        # Scores with a truth of zeros, for their names and shapes alone
         row |= _score(summary, 0 * summary.mean, known)
     return {name: np.asarray(value)[None][:0] for name, value in row.items()}
 
@@ -396,11 +416,12 @@ def _gather_blocks(
     """Yield small states of one shape together, so that one call summarizes them."""
 
     def shape_of(pair: Believed[AnyState]) -> tuple[int, ...]:
-        # States that cannot be stacked get a block each: a size that fills it.
+        # The shape of the belief, the second of the pair. States that cannot be stacked get a block
+        # each: a size that fills it.
         return cast(SensorState, pair[1]).belief.shape if batched else (_BLOCK_SIZE,)
 
     for shape, same_shape in groupby(believed, shape_of):
-        # A state that is large by itself is a block.
+        # How many states fill a block; a state that is large by itself is one.
         size = max(1, _BLOCK_SIZE // math.prod(shape))
         block = list(islice(same_shape, size))
         while block:
@@ -418,6 +439,7 @@ def _read_keep(
     if keep is None:
         return None
     ledger = [(name, f"{name}_total") for name in _LEDGER_FIELDS]
+    # The names of all variables; the sum joins the pairs.
     recorded = {*_read_nothing(f, start, known), *sum(ledger, ())}
     unknown = [name for name in keep if name not in recorded]
     if unknown:
@@ -435,13 +457,16 @@ def _read_truth(
     n_agents: int,
     times: Array,
 ) -> _KnownTruth | None:
-    """Check the truth, whose shape is (T, *runs) for each component."""
+    """Check the truth and what is scored with it; `shape` is (T, *runs).
+
+    The values of the result are (T, *runs, 1, d), or (T, *runs, A, d) for a truth of each agent.
+    """
     truth = recording.truth
     if truth is None:
         if recording.scored is not None:
             raise ValueError("scored must be None without a truth, got components")
         return None
-    # A table whose columns are components says itself which is which.
+    # A table of pandas whose columns are named as components are
     columns = getattr(truth, "columns", None)
     if columns is not None and set(columns) <= set(names):
         # It is read like a mapping.
@@ -453,6 +478,7 @@ def _read_truth(
         values = _read_series(truth, "truth", times)
         components = slice(None)
         if values.shape == (*shape, len(names)):
+            # One for all agents
             values = values[..., None, :]
         elif values.shape != (*shape, n_agents, len(names)):
             raise ValueError(
@@ -478,6 +504,7 @@ def _read_series(entry: TruthSeries, name: str, times: Array) -> Array:
             raise ValueError(
                 f"{name} must return one shape at all times, got {sorted(shapes)}"
             )
+        # A series (T, ...), as if it had been given instead of the function
         entry = np.stack(values) if values else np.zeros(0)
     return check_array(entry, name, finite=False)
 
@@ -500,6 +527,7 @@ def _read_components(
     for name, entry in truth.items():
         series = _read_series(entry, f"truth[{name!r}]", times)
         if series.shape == shape:
+            # One for all agents
             series = series[..., None]
         else:
             series = check_array(series, "truth", (*shape, n_agents), finite=False)
@@ -517,6 +545,7 @@ def _read_scored(
         raise InvalidArgumentError(
             f"scored must be a sequence of names of components, got {scored!r}"
         )
+    # A list of names for each agent, or one list for all
     rows: list[Sequence[str]] = list(scored)
     is_common = all(isinstance(name, str) for name in rows)
     if is_common:
@@ -547,6 +576,7 @@ def _select(values: Array, components: Components, *, behind: int = 0) -> Array:
     """
     if isinstance(components, slice) or components.ndim == 1:
         return values[..., components]
+    # Each agent's own: the index (A, k) gets axes of length 1, to broadcast against the values.
     n_agents, size = components.shape
     index = components.reshape(n_agents, *[1] * behind, size)
     lead = (1,) * (values.ndim - index.ndim)
@@ -564,6 +594,7 @@ def _score(summary: Summary, truth: Array, known: _KnownTruth) -> dict[str, Arra
     scores = known.scores
     mean = summary.mean
     truth = np.broadcast_to(truth, mean.shape)
+    # The errors of the components that are scored together, (..., A, k)
     together = _select(mean - truth, known.components)
     is_scored = np.asarray(np.isfinite(together).all(axis=-1))
     if "squared_error" in scores:
@@ -589,8 +620,9 @@ def _score(summary: Summary, truth: Array, known: _KnownTruth) -> dict[str, Arra
 def _covariance_of(summary: Summary, components: Components) -> Array | None:
     """Return the covariance of the known components; None if the summary has none."""
     if summary.covariance is not None:
-        rows = _select(summary.covariance, components, behind=1)
-        return _select(rows.mT, components, behind=1)
+        # The columns of the components, and of the transpose their rows
+        columns = _select(summary.covariance, components, behind=1)
+        return _select(columns.mT, components, behind=1)
     if summary.members is None:
         return None
     members = _select(summary.members, components, behind=1)
@@ -652,6 +684,7 @@ def final_state(run: xarray.Dataset) -> State:
 
 def _count_messages(name: str, total: Array) -> dict[str, object]:
     """Return one field of the ledgers as variables: in each step, and up to then."""
+    # Counts (T + 1,) of the network, or (T + 1, A) of each agent
     axes = ("time", "agent")[: total.ndim]
     unit = "B" if name.endswith("bytes") else "1"
     in_step = {"long_name": f"{name} in this step", "units": unit}
@@ -666,7 +699,9 @@ def _nees(error: Array, cov: Array) -> Array:
     """Return e' P^-1 e; infinite where an ensemble has collapsed, so that P is singular."""
     # In units of the standard deviations, so that units do not matter.
     correlation, unit = to_unit_variances(cov)
+    # The smallest eigenvalue of a correlation is zero up to rounding, some 1e-16 times d.
     is_singular = np.linalg.eigvalsh(correlation)[..., 0] <= 1e-12
+    # Any definite matrix serves there, since the result is replaced.
     correlation[is_singular] = np.eye(correlation.shape[-1])
     nees = quadratic_form(cholesky(correlation), error / unit)
     return np.where(is_singular, np.inf, nees)

@@ -64,7 +64,8 @@ def drop_repeated(
     >>> [float(o.value[0]) for o in result.observations[0]], len(result.repeated)
     ([2.0, 2.5], 1)
     """
-    # Candidates by time, agent and value; sensors are compared only where these agree.
+    # Candidates by time, agent and value; sensors are compared only where these agree. The
+    # fingerprint is the value in single precision, through which a copy may have gone.
     known: dict[Hashable, list[tuple[int | Sensor, Array, tuple[float, ...]]]] = {}
     for t, agent, sensor, value, metadata in assimilated:
         key = t, agent, _fingerprint(value)
@@ -75,6 +76,7 @@ def drop_repeated(
         """Return the observations that are not known yet; note them, and those that repeat."""
         new = []
         for o in entries:
+            # The observations with the same time, agent and value, an empty list at first
             same = known.setdefault((o.t, o.agent, _fingerprint(o.value)), [])
             if any(
                 is_equal_value(o.value, value) and _is_same(o, sensor, metadata, dim)
@@ -108,6 +110,7 @@ def find_rounded_copy(
     True
     """
     for t, agent, sensor, value, metadata in assimilated:
+        # Missing values are all alike.
         if np.isnan(value).all():
             continue
         for o in observations:
@@ -194,7 +197,8 @@ def _is_same(
         return True
     if observation.metadata != metadata or sensor.dim != of_observation.dim:
         return False
-    # A copy of the sensor predicts the same for any states.
+    # A copy of the sensor predicts the same for any states: five are drawn, with a fixed seed and
+    # far enough from each other.
     states = 10.0 * np.random.default_rng(0).standard_normal((5, dim))
     first, second = [s.predict(states) for s in (sensor, of_observation)]
     is_equal = np.array_equal(first, second, equal_nan=True)

@@ -66,6 +66,7 @@ def read_reset(
         )
     matrix = check_array(cov, "cov", (k, k))
     check_positive_semidefinite(matrix, "cov")
+    # The new values as a function of the state, also if they are constants
     if callable(value):
         return Reset(indices, partial(_call_value, value, k), matrix, chosen)
     constant = check_array(value, "value", (k,))
@@ -76,6 +77,7 @@ def _read_component(component: object, names: Sequence[str]) -> int:
     """Return the index of a component that is given by its index or its name."""
     if isinstance(component, str) and component in names:
         return list(names).index(component)
+    # An index that is no whole number stays -1, and is refused; True and False are none either.
     index = -1
     if isinstance(component, int | np.integer) and not isinstance(component, bool):
         index = int(component)
@@ -88,23 +90,28 @@ def _read_component(component: object, names: Sequence[str]) -> int:
 
 
 def _call_value(function: Callable[[Array], Array], k: int, x: Array) -> Array:
+    """Return the user's new values (..., k) of states (..., d), checked."""
     result = call_user(function, x.copy())
     return check_array(result, "value", (*x.shape[:-1], k))
 
 
 def _repeat_value(constant: Array, x: Array) -> Array:
+    """Return new values (k,) that do not depend on the states (..., d), for each of them."""
     return np.broadcast_to(constant, (*x.shape[:-1], constant.size))
 
 
 def reset_gaussian(state: Gaussians, reset: Reset) -> Gaussians:
     """Return a Gaussian state with new present components; the past keeps the former ones."""
     d = state.dim
+    # Index of the chosen agents in means (*runs, A, d)
     rows = (..., reset.agents, slice(None))
     present = state.means[rows]
+    # The derivative of the new values at the means, (*runs, agents, k, d), by differences
     slope, _error = difference_with_error(reset.value, present, np.subtract)
     means = state.joint_means.copy()
     covs = state.joint_covariances.copy()
-    # x' = T x + e: the identity, with the derivative of the new values in their rows.
+    # x' = T x + e for the joint state x, whose first d components are the present: T is the
+    # identity, with the derivative of the new values in their rows.
     size = means.shape[-1]
     transform = np.zeros((*slope.shape[:-2], size, size))
     transform[...] = np.eye(size)

@@ -48,7 +48,7 @@ def save_state(state: object, path: str | PathLike[str]) -> None:
     named = {f"a{k}": array for k, array in enumerate(arrays)}
     named["header"] = np.array(json.dumps(header))
     np.savez(buffer, allow_pickle=False, **named)
-    # The check sum stands behind the content, so that a cut file is found too.
+    # The check sum comes last, so that a file whose end is missing is found too.
     content = buffer.getvalue()
     # Written beside the file and then renamed, which a file system does at once.
     unfinished = Path(path).with_name(f".{Path(path).name}.part")
@@ -88,11 +88,12 @@ def load_fields(cls: type[T], path: str | PathLike[str]) -> T:
 
 
 def _class_name(cls: type) -> str:
+    """Return module and name of a class, as the header of a file has them."""
     return f"{cls.__module__}:{cls.__qualname__}"
 
 
 def _encode(value: object, arrays: list[NumpyArray]) -> Json:
-    """Return a value as JSON; its arrays are appended to `arrays` and stand as their numbers."""
+    """Return a value as JSON; arrays are appended to `arrays`, replaced by their index there."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.ndarray | np.generic):
@@ -100,16 +101,18 @@ def _encode(value: object, arrays: list[NumpyArray]) -> Json:
             raise ValueError("state must be numeric arrays to be saved, got objects")
         arrays.append(np.asarray(value))
         return {"array": len(arrays) - 1}
+    # A list is loaded as a tuple.
     if isinstance(value, tuple | list):
         return {"tuple": [_encode(item, arrays) for item in value]}
     if isinstance(value, np.random.Generator):
         bits = value.bit_generator
         seeds = cast(np.random.SeedSequence, bits.seed_seq)
-        # The state of its seed too, so that generators spawned from it later are the same.
+        # The state of its seed sequence too, so that generators spawned from it later are the same
         parts = (bits.state, seeds.state)
         return {"rng": [_encode(part, arrays) for part in parts]}
     if isinstance(value, dict):
         return {"dict": {name: _encode(item, arrays) for name, item in value.items()}}
+    # The fields of a dataclass, with its name beside them
     if is_dataclass(value) and not isinstance(value, type):
         items = {f.name: getattr(value, f.name) for f in fields(value)}
         encoded = {name: _encode(item, arrays) for name, item in items.items()}
@@ -137,6 +140,8 @@ def _decode(encoded: Any, arrays: dict[str, NumpyArray]) -> Any:
 
 
 def _decode_rng(state: Any, seed: Any) -> np.random.Generator:
+    """Return a generator from the state of its bit generator and that of its seed sequence."""
+    # A file can name classes of bit generators only.
     bit_generator = getattr(np.random, state["bit_generator"])
     if not issubclass(bit_generator, np.random.BitGenerator):
         raise ValueError(f"bit generator {bit_generator}")

@@ -111,7 +111,7 @@ class State(FrozenModel):
 
     @property
     def lagged_states(self) -> tuple[Self, ...]:
-        """A state for each of these times, given all observations up to now; none by default."""
+        """A state for each of `times`, given all observations up to now; none by default."""
         return ()
 
     def lagged_times(self, lag: int, t: float) -> tuple[float, ...]:
@@ -127,7 +127,7 @@ class State(FrozenModel):
         ... )
         ((0.0,), [(0.0,), (0.0,), (0.0,), (), (1.0,), (0.0, 1.0)])
         """
-        # A step of no length keeps the past as it is.
+        # A step of no length keeps the past as it is; another one adds the state's own time.
         if t == self.t:
             return self.times
         return (*self.times, self.t)[-lag:] if lag else ()
@@ -138,7 +138,8 @@ class State(FrozenModel):
         The file appears whole or not at all: a full disk leaves an earlier one as it was. Its last
         32 bytes are the SHA-256 of those before.
         """
-        # Sensors that came with an observation cannot be written.
+        # Sensors that came with an observation cannot be written. The third of an entry is a sensor
+        # or its number.
         entries = [entry for entry in self.assimilated if isinstance(entry[2], int)]
         save_state(self.replace(assimilated=tuple(entries)), path)
 
@@ -214,6 +215,7 @@ class SensorState(State):
     @property
     def runs(self) -> tuple[int, ...]:
         """Leading axes: independent runs of the network."""
+        # The axes are (..., "A", ...), of which the first stands for the runs.
         _name, axes = self.belief_field
         return self.belief.shape[: 1 - len(axes)]
 
@@ -229,7 +231,7 @@ class SensorState(State):
 
     @property
     def lagged_states(self) -> tuple[Self, ...]:
-        """A state for each of these times, given all observations up to now.
+        """A state for each of the earlier `times`, given all observations up to now.
 
         The joint distribution over the times is kept, by draws too:
 
@@ -277,7 +279,8 @@ class SensorState(State):
 def stack_states(states: Sequence[AnyState]) -> AnyState:
     """Stack several states of one shape, with a first axis of runs."""
     first = states[0]
-    # Everything else, such as the time, is taken from the first state.
+    # Everything but arrays, such as the time, is taken from the first state. So are two arrays that
+    # no summary needs: the first of them is None in some states.
     arrays = {}
     for name, value in vars(first).items():
         if type(value) is np.ndarray and name not in ("unseen", "rejection_streaks"):

@@ -28,7 +28,7 @@ from ..validation.batching import name_of_check
 from ..validation.first_use import needs_check
 from . import failures
 from .changes import Previous, References
-from .exchange import Known, collect_observations, fuse_beliefs
+from .exchange import ObservationsByTime, collect_observations, fuse_beliefs
 from .failures import RECOVERABLE, FilterError, Row
 from .gating import RejectionStreaks
 from .observations import Observation, sensor_of
@@ -43,10 +43,10 @@ __all__ = ["Received", "Step", "copy_rng", "group_agents"]
 S = TypeVar("S", bound=State)
 
 _NO_RUNS = np.zeros((), dtype=bool)
-_NOTHING = np.zeros((0, 0))
+_NO_SHARED = np.zeros((0, 0))
 _LOG_2PI = math.log(2 * math.pi)
-_FEW = 64
-"""Up to how many agents many plans of their observations are kept."""
+_FEW_AGENTS = 64
+"""Up to how many agents the large cache of plans is used, see `_plan_few`."""
 
 
 class Step(Generic[S]):
@@ -189,34 +189,43 @@ class Step(Generic[S]):
         f = self.filter
         shape = (*self.runs, f.n_agents)
         if f.gate_probability is not None:
+            # How many the gate rejects in this step, and how many in a row up to now
             self.rejected = np.zeros(shape)
             self.streaks = RejectionStreaks(f, self.state, self.runs)
         if f.record_evidence:
+            # Log-density of the observations, normalised innovation squared, count of numbers
             for name in ("log_likelihood", "nis", "n_observed"):
                 self.scores[name] = np.zeros(shape)
 
     # The beliefs -----------------------------------------------------------------------
 
     def check_forecast(self, values: Array, old: Array | float) -> Array:
-        """Return a finite forecast (*runs, A, ...), and `old` in failed runs."""
-        # A finite sum of squares proves that all are finite; it may overflow.
+        """Return a forecast (*runs, A, ...) with `old` in runs that have failed, or fail now.
+
+        A run fails if its forecast is not finite.
+        """
+        # A finite sum of squares proves that all are finite. It may overflow, so that the rows
+        # are looked at if it is not.
         if not math.isfinite(np.vdot(values, values)):
-            # One row for each run and agent.
+            # One row for each run and agent: the axes (*runs, A).
             lead = len(self.runs) + 1
             errors = failures.find_nonfinite_rows(values, lead, "forecast")
             self.record_failures(errors, range(self.filter.n_agents))
         # Groups of agents are updated in place, which must not change the state.
         before = cast(SensorState, self.state)
+        # `belief_field` has the name and the axes of the state's array of beliefs.
         if np.may_share_memory(values, getattr(before, before.belief_field[0])):
             values = values.copy()
         return self.keep_failed(values, old) if self.any_failed else values
 
     def stack(self, forecast: Array) -> list[Array]:
-        """Return copies of the beliefs about the earlier times, then the present forecast."""
+        """Return copies of the beliefs about the earlier `times`, then the present forecast."""
         if not self.times:
             return [forecast]
         state = cast(SensorState, self.state)
         if self.references is not None:
+            # Sensors of changes need beliefs that the lag does not keep: all are looked up by
+            # their times, from pairs (time, belief).
             beliefs = dict((*state.references, *state.past))
             if self.dt > 0:
                 beliefs[state.t] = state.belief
@@ -234,7 +243,7 @@ class Step(Generic[S]):
         """Return the values, but `old` in failed runs."""
         if not self.any_failed:
             return values
-        # The flags (*runs) get axes of size 1 behind, to broadcast against the values.
+        # The flags (*runs) get axes of size 1 behind, to broadcast against values (*runs, ...).
         trailing = (1,) * (values.ndim - self.failed.ndim)
         failed = self.failed.reshape(*self.runs, *trailing)
         return np.asarray(np.where(failed, old, values))
@@ -242,29 +251,35 @@ class Step(Generic[S]):
     # The observations ------------------------------------------------------------------
 
     def received(self) -> Iterator[tuple[int, Received]]:
-        """Yield the groups of agents with their observations, oldest time first.
+        """Yield groups of agents with the observations that each received, oldest time first.
 
-        Each comes with its place among the times, of which the last is now. The target is NaN in
-        failed runs, so that they are left alone.
+        An agent's own observations are among them. A group holds observations of one time, and
+        comes with the index of this time in ``(*times, t)``, of which the last is now. The
+        observed values are NaN in failed runs, so that no update changes these.
         """
-        by_time = self._known_observations()
-        for place, t in enumerate((*self.times, self.t)):
+        by_time = self._collect_by_time()
+        for time_index, t in enumerate((*self.times, self.t)):
             if t not in by_time:
                 continue
             # Agents with equally many numbers are one group.
             for group in group_agents(by_time[t]):
                 if self.any_failed:
                     group = group.with_target(self.keep_failed(group.target, np.nan))
-                # Of a model with angles: the first prediction checks that the sensor knows of them.
+                # Of a model with angles: the first prediction checks that the sensor gives the same
+                # after a full turn, or has a period itself.
                 if self.filter.periods:
                     group.circular_model = self.filter.model
-                # With a gate: which series of rejections in a row each observation goes on with
+                # With a gate: the number of the streak, the rejections in a row, that each
+                # observation continues or ends.
                 if self.streaks is not None:
                     group.streaks = self.streaks.list_numbers(t, group.agents)
-                yield place, group
+                yield time_index, group
 
-    def _known_observations(self) -> Known:
-        """Return by time, and then by agent, the sensors and values that each agent has."""
+    def _collect_by_time(self) -> ObservationsByTime:
+        """Return the observations by time, and then by agent, as pairs of sensor and value.
+
+        They are those that each agent has after the exchange of observations, if there is one.
+        """
         f = self.filter
         if self.delayed or (f.graph is not None and f.share_observations):
             return collect_observations(self)
@@ -274,11 +289,12 @@ class Step(Generic[S]):
         for agent, observations in enumerate(self.observations):
             of_agent: list[tuple[Sensor, Array]] = []
             for o in observations:
-                # Sensors of changes, and a gate, keep count of each agent's observations.
+                # Sensors of changes, and a gate, need to know later whose observation each is.
                 if self.references is not None:
                     self.references.receive(agent, o)
                 if self.streaks is not None:
                     self.streaks.note(self.t, agent, o)
+                # It comes with an observation, or is one of the agent's, by its number.
                 sensor = o.sensor
                 if isinstance(sensor, int):
                     sensor = f.agent_sensors[o.agent][sensor]
@@ -286,20 +302,23 @@ class Step(Generic[S]):
             pairs.append(of_agent)
         return {self.t: pairs}
 
-    def before(
+    def find_previous(
         self,
-        place: int,
+        time_index: int,
         group: Received,
         past: list[Array],
         origin: Array | None = None,
     ) -> list[Previous] | None:
         """Return the earlier members with which a group's sensors of changes compare, if any.
 
-        They are among the `past`, or those with which the step begins, if it has a length: the
-        state's, or `origin` if these have been resampled.
+        They are among the `past`, the members of the earlier `times`, or those with which the step
+        begins, if it has a length: the state's, or `origin` if these have been resampled. None for
+        a group of an earlier time, since delayed observations of changes are refused.
         """
-        if not group.changes or self.references is None or place < len(self.times):
+        is_now = time_index >= len(self.times)
+        if not group.changes or self.references is None or not is_now:
             return None
+        # Time and members at the beginning of the step
         start = None
         if self.dt > 0:
             start = (
@@ -314,29 +333,31 @@ class Step(Generic[S]):
         moments: Callable[..., tuple[Array, Array]],
         predicted: Array,
         *args: Array,
-        is_torn: bool = False,
+        near_observed: bool = False,
         is_gaussian: bool = True,
         weighted: tuple[Array, Array] | None = None,
     ) -> Received:
         """Return a group without the observations that the gate rejects, and count these.
 
-        ``moments(predicted, *args)`` gives mean (*runs, G, M) and covariance (*runs, G, M, M) of
-        the predictions (*runs, G, N, M), without the observations' noise. With `is_torn` the
-        predictions of angles lie near the observed value, each by itself. The other observations
-        are scored, if the filter records that: their log-likelihood too, if predictions are taken
-        as Gaussian. `weighted` holds the members (*runs, G, N, d) and their weights (*runs, G, N),
-        by which likelihood sensors are predicted.
+        The group has G agents with M observed numbers each, and N predictions of them by each
+        agent's N members. ``moments(predicted, *args)`` gives mean (*runs, G, M) and covariance
+        (*runs, G, M, M) of the predictions (*runs, G, N, M), without the observations' noise. With
+        `near_observed` each prediction of an angle was brought within half a period of the observed
+        value. The observations that pass are scored, if the filter records that: their
+        log-likelihood too, if predictions are taken as Gaussian. `weighted` holds the members
+        (*runs, G, N, d) and their weights (*runs, G, N), by which likelihood sensors are predicted.
         """
         if self.rejected is None and not self.scores:
             return group
-        if is_torn and group.wraps:
-            # About one prediction, then about their mean: opposite to the observed value the
-            # branch cut would divide them.
+        if near_observed and group.wraps:
+            # Angles near half a turn from the observed value lie on both sides of it, and their
+            # mean between them. So all are brought near the first one, then near their mean.
             predicted = group.wrap_near(predicted.copy(), predicted[..., :1, :])
             mean, _ = moments(predicted, *args)
             predicted = group.wrap_near(predicted, mean[..., None, :])
         mean, cov = moments(predicted, *args)
-        # The innovation is the shorter way round.
+        # The mean within half a period of the observed value: the innovation is then the shorter
+        # way round.
         mean = group.wrap_near(mean[..., None, :].copy(), group.target[..., None, :])
         mean = mean[..., 0, :]
         if weighted is not None and group.likelihoods:
@@ -364,6 +385,7 @@ class Step(Generic[S]):
             return
         self.rejected[agent] += is_rejected
         streaks = cast(RejectionStreaks, self.streaks)
+        # The streak is lengthened by one, or ended; a warning if it has reached the limit.
         number = streaks.number_of(agent, observation)
         rejected = np.array([is_rejected])
         if streaks.count(np.array([number]), rejected, ~rejected).any():
@@ -373,11 +395,15 @@ class Step(Generic[S]):
     def _score(
         self, group: Received, mean: Array, cov: Array, is_gaussian: bool
     ) -> None:
-        """Add the scores of a group's observations to those of the step."""
+        """Add the scores of a group's observations to those of the step.
+
+        `mean` (*runs, G, M) and `cov` (*runs, G, M, M) are those of the predictions without noise.
+        """
         innovation = group.target - mean
         missing = np.isnan(innovation)
         n_observed = (~missing).sum(axis=-1)
-        # These count, but their innovations are unknown, and so is the sum that they belong to.
+        # Numbers of likelihood sensors without moments: they count as observed, but have no
+        # innovation, so that the agent's sum of squares is unknown (NaN).
         n_unpredicted = group.count_unpredicted()
         # Missing numbers have a zero innovation and a unit covariance.
         is_pair = ~missing[..., :, None] & ~missing[..., None, :]
@@ -385,6 +411,7 @@ class Step(Generic[S]):
         innovation_cov = np.where(is_pair, cov + group.noise, unit)
         innovation = np.where(missing, 0.0, innovation)
 
+        # `apply` also passes an array that all rows share and a generator, not needed here.
         def compute(r: Array, s: Array, *_: object) -> tuple[Array, ...]:
             # ε = rᵀ S⁻¹ r, and log det S
             lower = cholesky(s)
@@ -415,7 +442,7 @@ class Step(Generic[S]):
         fallback: tuple[Array, ...],
         agents: Sequence[int] | Indices | None = None,
         *,
-        shared: Array = _NOTHING,
+        shared: Array = _NO_SHARED,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, ...]:
         """Compute on a batch (*runs, ...) or (*runs, G, ...) whose rows may fail one by one.
@@ -437,6 +464,7 @@ class Step(Generic[S]):
         tuple of ndarray
             The results; failures are recorded, or raised if the filter says so.
         """
+        # How many leading axes count rows: those of the runs, and that of the agents
         lead = len(self.runs) + (agents is not None)
         # The state of the generator, to draw the same numbers in a second attempt.
         rng_state: Mapping[str, object] | None = None
@@ -477,7 +505,8 @@ class Step(Generic[S]):
     ) -> None:
         """Mark the runs of these errors as failed, or raise the first error.
 
-        The keys are runs, and with `agents` end with a place among these.
+        A key is the index of a run, (*runs); with `agents` the position of an agent in these
+        follows as its last entry.
         """
         if not errors:
             return
@@ -541,7 +570,7 @@ class Step(Generic[S]):
             The fields of the family's own, such as the means of Gaussians.
         """
         state = self.state
-        # A long run keeps many states: a field with its default is left out, to take no place.
+        # A long run keeps many states: fields with their default are left out to save memory.
         if isinstance(state, SensorState):
             # The lag keeps earlier times, and so do sensors of changes, which refer to them.
             if self.times or self.references is not None:
@@ -580,12 +609,13 @@ class Step(Generic[S]):
     ) -> dict[str, object]:
         """Return the state's fields about the earlier times that the lag or a sensor keeps.
 
-        `given` are those that the family gives by itself.
+        `past` has a belief for each of `times`; `given` are the fields that the family returns.
         """
+        # Times and beliefs. A family that keeps its past in a form of its own gives none here.
         pairs = list(zip(self.times, past, strict=False))
         fields: dict[str, object] = {}
-        # A family may keep its past in its own form; otherwise it is (time, belief) pairs.
         if "history" not in given:
+            # The times of the lag; `times` has those that sensors of changes need too.
             fields["history"] = tuple(
                 [pair for pair in pairs if pair[0] in self.lagged]
             )
@@ -603,6 +633,7 @@ class Step(Generic[S]):
             kept_times = (*self.lagged, self.t)
             before = self.state.assimilated
             result = [entry for entry in before if entry[0] in kept_times]
+        # The present ones agent by agent, then the delayed ones
         for entries in (*self.observations, self.delayed):
             for o in entries:
                 # The user may change the array before the next step, unless it is a frozen copy.
@@ -621,10 +652,14 @@ class Step(Generic[S]):
         if key in self.warned:
             return
         self.warned = (*self.warned, key)
+        # The warning names a line four frames up, near the user's call.
         warnings.warn(text, category, stacklevel=4)
 
     def note_unseen(self, group: Received, is_unseen: Mask, reason: str) -> None:
-        """Count the observed numbers (*runs, G, M) that no update can use, and say so once."""
+        """Count observations with numbers (*runs, G, M) that no update can use, and warn once.
+
+        The sensor does not see from the belief: its prediction does not exist.
+        """
         is_unseen = is_unseen & ~np.isnan(group.target)
         if not is_unseen.any():
             return
@@ -634,7 +669,8 @@ class Step(Generic[S]):
         for k in range(int(group.sensor_index.max()) + 1):
             of_sensor = is_unseen & (group.sensor_index == k)
             self.unseen[..., group.agents] += of_sensor.any(axis=-1)
-        *_, g, column = np.argwhere(is_unseen)[0].tolist()
+        # The warning names the first: agent g of the group, and a column of its M numbers.
+        *_run, g, column = np.argwhere(is_unseen)[0].tolist()
         self.warn_once(
             "unseen",
             f"observations must be predicted to be used, but {reason}: agent "
@@ -644,18 +680,24 @@ class Step(Generic[S]):
 
 
 class _Part(NamedTuple):
-    """One sensor of a group: which agents have it, and where its numbers stand."""
+    """One sensor of a group of G agents: which of them have it, and which numbers are its own."""
 
     sensor: Sensor
     agents: Indices | slice
-    """Places of these agents in the group, or a slice if all have it."""
-    cells: tuple[Indices | slice, Indices | slice]
-    """Index of the sensor's numbers in arrays (G, M)."""
+    """Positions of these agents in the group, (K,), or a slice if all have it."""
+    target_index: tuple[Indices | slice, Indices | slice]
+    """Index of the sensor's m numbers of each agent in arrays (..., G, M), as the targets are.
+
+    Row and column indices (K, 1) and (K, m), or two slices of everything.
+    """
 
 
 def _block_of(part: _Part) -> tuple[Indices | slice | EllipsisType, ...]:
-    """Return the index of a sensor's block in covariances (*runs, G, M, M)."""
-    rows, columns = part.cells
+    """Return the index of a sensor's block in covariances (*runs, G, M, M).
+
+    Its numbers' columns (K, m) are both the rows and the columns of the block, (K, m, m).
+    """
+    rows, columns = part.target_index
     if isinstance(rows, slice) or isinstance(columns, slice):
         return (..., rows, columns, columns)
     return (..., rows[..., None], columns[..., :, None], columns[..., None, :])
@@ -674,8 +716,13 @@ class Received:
         The observed values, NaN where a component is missing.
     noise : ndarray, (M, M) or (G, M, M)
         Covariance of their noise, one for all agents if it is the same.
-    linear, changes : bool
-        Whether all sensors are linear; whether one of them measures a change.
+    linear, changes, wraps : bool
+        Whether all sensors are linear; whether one of them measures a change; whether one of them
+        measures an angle.
+    parts : list of _Part
+        The different sensors, with the agents and the numbers of each.
+    sensor_index : ndarray of int, (G, M)
+        Which of its agent's sensors each number belongs to.
 
     Examples
     --------
@@ -737,21 +784,31 @@ class Received:
         self._checked: set[tuple[Sensor, bool]] = set()
 
     def _make_part(self, sensor: Sensor, starts: list[tuple[int, int]]) -> _Part:
-        places, first = np.array(starts, dtype=np.intp).T
+        """Describe where a sensor's numbers are.
+
+        `starts` are pairs of an agent's position in the group and the column of its first number.
+        """
+        positions, first = np.array(starts, dtype=np.intp).T
+        # The columns of the sensor's m numbers, (K, m)
         columns = first[:, None] + np.arange(sensor.dim)
         if columns.shape == self.sensor_index.shape:
             # The only sensor of the group: slices give views instead of copies.
             return _Part(sensor, slice(None), (slice(None), slice(None)))
-        return _Part(sensor, places, (places[:, None], columns))
+        return _Part(sensor, positions, (positions[:, None], columns))
 
     def _assemble_noise(self, starts: dict[Sensor, list[tuple[int, int]]]) -> Array:
-        """Put the sensors' covariances on the diagonal, (G, M, M), or (M, M) if all agree."""
-        n, size = self.sensor_index.shape
-        noise = np.zeros((n, size, size))
-        for sensor, places in starts.items():
+        """Put the sensors' noise covariances on the diagonals of the G agents' matrices.
+
+        `starts` has for each sensor the positions of its agents in the group, each with the column
+        of its first number. The result is (G, M, M), or (M, M) if all agents agree.
+        """
+        n_agents, size = self.sensor_index.shape
+        noise = np.zeros((n_agents, size, size))
+        for sensor, positions in starts.items():
+            # It has a likelihood in place of a noise: its block stays zero.
             if isinstance(sensor, LikelihoodSensor):
                 continue
-            for g, start in places:
+            for g, start in positions:
                 block = slice(start, start + sensor.dim)
                 noise[g, block, block] = sensor.noise_cov
         return noise[0] if (noise == noise[:1]).all() else noise
@@ -763,10 +820,11 @@ class Received:
         """
         if not self.wraps:
             return None
+        # Numbers that are no angles never wrap.
         result = np.full(self.sensor_index.shape, np.inf)
         for part in self.parts:
             if part.sensor.half_periods is not None:
-                result[part.cells] = part.sensor.half_periods
+                result[part.target_index] = part.sensor.half_periods
             elif part.sensor.wraps:
                 return None
         return result
@@ -776,43 +834,49 @@ class Received:
         """Whether all agents of the group have the same sensors, in the same order."""
         n_agents = len(self.agents)
         for part in self.parts:
-            _, columns = part.cells
+            _, columns = part.target_index
             if isinstance(part.agents, slice) or isinstance(columns, slice):
                 continue
-            # A sensor that an agent has twice is listed twice.
+            # Every column at which the sensor's numbers start must be that of all agents. The
+            # columns are (K, m), with a row for each time that an agent has the sensor.
             firsts = np.unique(columns[:, 0])
             if len(part.agents) != n_agents * len(firsts):
                 return False
         return True
 
     def collect(self, function: Callable[[Sensor], Array]) -> Array:
-        """Return values (dim, k) of each sensor for all numbers of the group, (G, M, k)."""
+        """Evaluate a function of a sensor, (m, k), for all numbers of the group, (G, M, k)."""
         values = [np.asarray(function(part.sensor)) for part in self.parts]
         result = np.empty((*self.sensor_index.shape, values[0].shape[-1]))
         for part, value in zip(self.parts, values, strict=True):
-            result[part.cells] = value
+            result[part.target_index] = value
         return result
 
     def H(self, dim: int) -> Array:
-        """Return the matrices of linear sensors one below the other, (G, M, d), made once."""
+        """Return the matrices of linear sensors one below the other, (G, M, d), made once.
+
+        `dim` is the size d of the state.
+        """
         if dim not in self._matrices:
             matrix = np.zeros((*self.sensor_index.shape, dim))
             for part in self.parts:
-                matrix[part.cells] = part.sensor.H(dim)
+                matrix[part.target_index] = part.sensor.H(dim)
             self._matrices[dim] = matrix
         return self._matrices[dim]
 
     def kind_of(self, g: int, column: int) -> str:
-        """Return the kind of the sensor that a number of the g-th agent belongs to."""
+        """Return the kind of the sensor that one of the M numbers of the g-th agent belongs to."""
+        # The position of each number's sensor in `parts`
         owners = np.zeros(self.sensor_index.shape, dtype=np.intp)
         for k, part in enumerate(self.parts):
-            owners[part.cells] = k
+            owners[part.target_index] = k
         return str(self.parts[owners[g, column]].sensor.kind)
 
     def log_likelihood(self, states: Array) -> tuple[Received, Array | float]:
         """Return the log-likelihoods of states (*runs, G, N, d) by sensors that are likelihoods.
 
-        They are (*runs, G, N), and come behind the group without these sensors' observations.
+        They are (*runs, G, N), the second result. The first is the group without these sensors'
+        observations, for the Gaussian ones that remain.
         """
         if not self.likelihoods:
             return self, 0.0
@@ -820,20 +884,21 @@ class Received:
         target = self.target.copy()
         for part in self.likelihoods:
             sensor = cast(LikelihoodSensor, part.sensor)
-            observed = target[(..., *part.cells)]
+            observed = target[(..., *part.target_index)]
             members = states[..., part.agents, :, :]
             values = sensor.evaluate(members, observed[..., None, :])
             # An agent may have several observations of one sensor.
             # Any: numpy's types of `at` have no index of several axes.
             index: Any = (..., part.agents, slice(None))
             np.add.at(logs, index, values)
+        # The rest of the group, in whose target these sensors' numbers become missing below. These
+        # get a unit variance, so that R has an inverse.
         rest = self.with_target(target)
-        # The missing numbers get a unit variance, so that R has an inverse.
         rest.noise = np.array(
             np.broadcast_to(self.noise, (*target.shape[-2:], target.shape[-1]))
         )
         for part in self.likelihoods:
-            target[(..., *part.cells)] = np.nan
+            target[(..., *part.target_index)] = np.nan
             rest.noise[_block_of(part)] = np.eye(part.sensor.dim)
         return rest, logs
 
@@ -849,7 +914,7 @@ class Received:
         """Return moments of the predictions with those of likelihood sensors put in.
 
         These are sums over the members `states` (*runs, G, N, d) with `weights` (*runs, G, N), in
-        the sensors' places of `mean` (*runs, G, M) and `cov` (*runs, G, M, M). A sensor without
+        the sensors' cells of `mean` (*runs, G, M) and `cov` (*runs, G, M, M). A sensor without
         moments is an error if they are required, as for a gate; otherwise its mean is NaN, and
         :meth:`count_unpredicted` counts its observations.
         """
@@ -858,18 +923,19 @@ class Received:
         for part in self.likelihoods:
             sensor = cast(LikelihoodSensor, part.sensor)
             if sensor.moments is None and not is_required:
-                mean[(..., *part.cells)] = np.nan
+                mean[(..., *part.target_index)] = np.nan
                 continue
             means, covs = sensor.predict_moments(states[..., part.agents, :, :])
             # E[y] = Σ wᵢ mᵢ and Cov[y] = Σ wᵢ (Rᵢ + (mᵢ - E[y]) (mᵢ - E[y])ᵀ)
             w = weights[..., part.agents, :]
-            # Angles on one branch, and that on the branch of the observed value
+            # Angles within half a period of their circular mean, and then their mean within half a
+            # period of the observed value
             means = fold(means, cast(Periods, sensor.periods), w)
             centre = np.einsum("...n,...nm->...m", w, means)
             anomalies = means - centre[..., None, :]
             covs = covs + anomalies[..., :, None] * anomalies[..., None, :]
-            observed = self.target[(..., *part.cells)]
-            mean[(..., *part.cells)] = sensor.bring_near(centre, observed)
+            observed = self.target[(..., *part.target_index)]
+            mean[(..., *part.target_index)] = sensor.bring_near(centre, observed)
             cov[_block_of(part)] = np.einsum("...n,...nij->...ij", w, covs)
         return mean, cov
 
@@ -878,7 +944,7 @@ class Received:
         count = np.zeros(self.target.shape[:-1])
         for part in self.likelihoods:
             if cast(LikelihoodSensor, part.sensor).moments is None:
-                observed = ~np.isnan(self.target[(..., *part.cells)])
+                observed = ~np.isnan(self.target[(..., *part.target_index)])
                 self._add_by_agent(count, part, observed.sum(axis=-1))
         return count
 
@@ -907,11 +973,12 @@ class Received:
     ) -> Array:
         """Predict the observations of states (*runs, G, N, d) without noise, (*runs, G, N, M).
 
-        Angles are brought onto one branch about the prediction of the states' mean, and then all
-        together onto the branch of the observed value that is nearest to their mean, or, with
-        ``"first"``, to that of the first state. With ``"each"`` every prediction is brought near
-        the observed value by itself, as likelihoods need it. `previous` holds the states at the
-        time that a sensor of changes compares with, or several such times.
+        A branch is a choice of the multiple of the period that is added to an angle. Predicted
+        angles are brought onto one branch, about the prediction of the states' mean, and are then
+        shifted together by whole periods, until their mean, or with ``"first"`` the prediction of
+        the first state, is within half a period of the observed value. With ``"each"`` every
+        prediction is brought that near by itself, as likelihoods need it. `previous` holds the
+        states at the time that a sensor of changes compares with, or several such times.
         """
         if isinstance(previous, list):
             return self._predict_changes(states, previous, branch)
@@ -922,8 +989,9 @@ class Received:
             result = np.asarray(
                 states @ np.ascontiguousarray(self.H(states.shape[-1]).mT)
             )
-            # A linear prediction runs on, so that no cut divides it.
-            return self._place(result, branch) if self.wraps else result
+            # Linear predictions of states near each other are not wrapped: they are near each other
+            # too.
+            return self._bring_near_target(result, branch) if self.wraps else result
         if self.has_one_part:
             values = self._predict_part(self.parts[0], states, previous, branch)
             # A copy, since the user's function may keep its result.
@@ -935,15 +1003,16 @@ class Received:
             for part in self.parts:
                 # Only sensors that measure a change need the previous states.
                 before = None if previous is None else previous[..., part.agents, :, :]
+                # The states of the K agents that have it, (*runs, K, N, d)
                 of_agents = states[..., part.agents, :, :]
                 values = self._predict_part(part, of_agents, before, branch)
-                rows[(..., *part.cells, slice(None))] = values.swapaxes(-1, -2)
+                rows[(..., *part.target_index, slice(None))] = values.swapaxes(-1, -2)
             result = np.ascontiguousarray(rows.swapaxes(-1, -2))
         if not math.isfinite(np.vdot(result, result)) and np.isinf(result).any():
             raise ValueError(
                 "predicted must have finite numbers or NaN (missing), got infinity"
             )
-        return self._place(result, branch) if self.wraps else result
+        return self._bring_near_target(result, branch) if self.wraps else result
 
     def _predict_changes(
         self,
@@ -951,21 +1020,29 @@ class Received:
         previous: list[Previous],
         branch: Literal["mean", "first", "each"],
     ) -> Array:
-        """Predict where each number is compared with the earlier states of a time of its own."""
+        """Predict where each number is compared with the earlier states of a time of its own.
+
+        All numbers are predicted with the states of each time, and each takes its own time's.
+        """
         result: Array | None = None
-        for members, cells in previous:
+        # `is_compared` (*runs, G, M): the numbers that are compared with these members
+        for members, is_compared in previous:
             predicted = self.predict(states, members, branch=branch)
             if result is None:
                 result = predicted
             else:
-                result = np.where(cells[..., None, :], predicted, result)
+                result = np.where(is_compared[..., None, :], predicted, result)
         return cast(Array, result)
 
-    def _place(self, predicted: Array, branch: str) -> Array:
-        """Bring predictions near the observed value: each, or all by the same periods."""
+    def _bring_near_target(self, predicted: Array, branch: str) -> Array:
+        """Bring predictions (*runs, G, N, M) near the observed value, by whole periods.
+
+        With the branch "each" every prediction by itself; otherwise all N by the same shift.
+        """
         target = self.target[..., None, :]
         if branch == "each":
             return self.wrap_near(predicted, target)
+        # The prediction that decides: the first state's, or the mean of all
         centre = predicted[..., :1, :]
         if branch == "mean" and predicted.shape[-2] > 1:
             centre = predicted.mean(axis=-2, keepdims=True)
@@ -975,7 +1052,7 @@ class Received:
             if np.count_nonzero(is_near) == is_near.size:
                 return predicted
         shift = self.wrap_near(centre.copy(), target) - centre
-        # Exactly zero where nothing turns; NaN where some state cannot be seen.
+        # Exactly zero where nothing is shifted; NaN where some state has no prediction.
         if not np.count_nonzero(shift):
             return predicted
         return np.asarray(predicted + np.where(np.isnan(shift), 0.0, shift))
@@ -983,30 +1060,40 @@ class Received:
     def _check_sensors(
         self, model: Model, states: Array, previous: Array | None
     ) -> None:
-        """Refuse sensors without a period that change when a circular component turns once."""
+        """Refuse a sensor whose prediction changes when an angle of the state turns once.
+
+        A sensor that measures an angle has to have its period.
+        """
         for part in self.parts:
             rows = (..., part.agents, slice(None), slice(None))
             before = None if previous is None else previous[rows]
-            observed = self.target[(..., *part.cells)]
+            observed = self.target[(..., *part.target_index)]
             check_sensor(part.sensor, model, states[rows], before, observed)
 
     def _predict_part(
         self, part: _Part, states: Array, previous: Array | None, branch: str
     ) -> Array:
-        """Predict with one sensor; its function is called directly once it has been checked."""
+        """Predict with one sensor, (*runs, K, N, m), the states (*runs, K, N, d) of its agents.
+
+        Its function h is called directly once :meth:`Sensor.predict` has checked it.
+        """
         sensor = part.sensor
         shape = (*states.shape[:-1], sensor.dim)
         if isinstance(sensor, LikelihoodSensor):
-            # Nothing is compared with it: see `log_likelihood`.
+            # It needs no prediction: `log_likelihood` evaluates it at the states.
             return np.zeros(shape)
+        # A function may work for a single state and fail for several: both have to be checked.
         is_single = states.size == states.shape[-1]
         if (sensor, is_single) in self._checked:
             # A copy, since the user's function may work in place.
             values = np.asarray(call_user(sensor.h, states.copy()), dtype=np.float64)
             if values.shape != shape:
+                # The checked call raises an error that says which shape is needed.
                 values = sensor.predict(states, previous)
         else:
             values = sensor.predict(states, previous)
+            # `predict` checks h when it first gets a single state, and when it first gets several.
+            # A sensor of changes has two arguments, and is never called directly.
             check = name_of_check("h", states)
             if not sensor.uses_previous and not needs_check(sensor, check):
                 self._checked.add((sensor, is_single))
@@ -1015,30 +1102,36 @@ class Received:
         return values
 
     def wrap_near(self, predicted: Array, reference: Array) -> Array:
-        """Bring predictions (*runs, G, N, M) onto the branch of a reference, in place."""
+        """Bring predictions (*runs, G, N, M) within half a period of a reference, in place.
+
+        The reference is (*runs, G, 1 or N, M).
+        """
         if not self.wraps:
             return predicted
+        # The states last, so that the target's index selects a sensor's numbers.
         values = predicted.swapaxes(-1, -2)
         # The reference for every state, NaN where the prediction is.
         full = (reference + 0 * predicted).swapaxes(-1, -2)
         for part in self.parts:
-            # A difference that does not wrap has one branch.
+            # A sensor without angles has nothing to bring near.
             if not part.sensor.wraps:
                 continue
-            index = (..., *part.cells, slice(None))
-            ours = values[index].swapaxes(-1, -2)
-            aim = full[index].swapaxes(-1, -2)
-            values[index] = part.sensor.bring_near(ours, aim).swapaxes(-1, -2)
+            index = (..., *part.target_index, slice(None))
+            of_sensor = values[index].swapaxes(-1, -2)
+            goal = full[index].swapaxes(-1, -2)
+            values[index] = part.sensor.bring_near(of_sensor, goal).swapaxes(-1, -2)
         return predicted
 
     def jacobian(self, states: Array, cov: Array | None = None) -> Array:
         """Return the derivatives of the observations at states (*runs, G, d), (*runs, G, M, d).
 
         The states have the covariances `cov`, (*runs, G, d, d). Where a sensor has no derivative,
-        or one that has to be checked first, differences are taken, whose steps they scale.
+        or one that has to be checked first, finite differences are taken, with steps in proportion
+        to the standard deviations.
         """
         d = states.shape[-1]
         if self.linear:
+            # The same for all runs, in an array of its own
             return np.full((*self.target.shape, d), self.H(d))
         std = None
         if self._differenced:
@@ -1058,11 +1151,11 @@ class Received:
             )
         result = np.empty((*self.target.shape, d))
         for part in self.parts:
-            # H of the sensor's agents, (*runs, agents, m, d)
+            # H of the sensor's K agents, (*runs, K, m, d)
             rows = (..., part.agents, slice(None))
             part_std = None if std is None else std[rows]
             slope = part.sensor.jacobian(states[rows], std=part_std)
-            result[(..., *part.cells, slice(None))] = slope
+            result[(..., *part.target_index, slice(None))] = slope
         return result
 
     def gate(
@@ -1094,6 +1187,7 @@ class Received:
         target = self.target
         rejected = np.zeros(innovation.shape[:-1])
         unit = np.eye(innovation.shape[-1])
+        # First the first sensor of every agent, then the second ones, and so on
         for k in range(int(self.sensor_index.max()) + 1):
             present = (self.sensor_index == k) & ~np.isnan(innovation)
             size = present.sum(axis=-1)
@@ -1112,7 +1206,9 @@ class Received:
 
 
 def predict_points(sensor: Sensor, states: Array) -> Array:
-    """Predict a sensor's observations of points (..., N, d), angles on one branch, (..., N, m).
+    """Predict a sensor's observations of points (..., N, d), (..., N, m).
+
+    Angles are shifted by whole periods, so that all N are near each other.
 
     >>> from distfilt.sensors import bearing
     >>> points = np.array([[-1.0, 0.1], [-1.0, -0.1]])
@@ -1125,16 +1221,16 @@ def predict_points(sensor: Sensor, states: Array) -> Array:
 def _gather_predictions(
     sensor: Sensor, values: Array, states: Array, previous: Array | None
 ) -> Array:
-    """Bring a sensor's predictions (*runs, G, N, m) of states (*runs, G, N, d) onto one branch.
+    """Shift angles in a sensor's predictions by whole periods, so that all N are near each other.
 
-    It lies about the prediction of the states' mean, since the observed value is not taken
-    farther than half a period from there.
+    The predictions are (*runs, G, N, m), of states (*runs, G, N, d); far ones are brought near the
+    prediction of the states' mean.
     """
     if values.shape[-2] == 1:
         return values
     half_periods = sensor.half_periods
     if half_periods is not None:
-        # The usual case: values within half a period are on one branch as they are.
+        # The usual case: all values lie within half a period as they are.
         low = values.min(axis=-2)
         if (values.max(axis=-2) - low < half_periods).all():
             return values
@@ -1143,6 +1239,8 @@ def _gather_predictions(
     if sensor.uses_previous and previous is not None:
         previous_mean = previous.mean(axis=-2, keepdims=True)
 
+    # References to which far values are brought near: the tangent, if the sensor is linear but for
+    # its wraps, and the prediction of the mean otherwise. Both are computed only if needed.
     def fallback() -> Array:
         return sensor.predict(mean, previous_mean)
 
@@ -1157,7 +1255,7 @@ def _gather_predictions(
 
 
 _Pattern = tuple[tuple[int, tuple[Sensor, ...]], ...]
-"""Which agents have observations, and of which sensors."""
+"""The agents that have observations, each with the sensors of these."""
 
 
 @lru_cache(maxsize=1024)
@@ -1173,13 +1271,20 @@ def _plan_many(pattern: _Pattern) -> list[Received]:
 
 
 def _plan_groups(pattern: _Pattern) -> list[Received]:
-    """Plan a group for each number of values that occurs."""
+    """Plan a group of the agents that have equally many observed numbers, for each such number.
+
+    The pattern has pairs of an agent and the sensors of its observations.
+    """
     agents_by_size: dict[int, list[int]] = {}
     for agent, sensors in pattern:
         size = sum(sensor.dim for sensor in sensors)
         agents_by_size.setdefault(size, []).append(agent)
-    by_agent = dict(pattern)
-    return [Received(agents, by_agent) for _, agents in sorted(agents_by_size.items())]
+    sensors_by_agent = dict(pattern)
+    # Groups of agents with few numbers first
+    return [
+        Received(agents, sensors_by_agent)
+        for _size, agents in sorted(agents_by_size.items())
+    ]
 
 
 def group_agents(
@@ -1200,8 +1305,11 @@ def group_agents(
             if pairs
         ]
     )
-    plans = _plan_few(pattern) if len(observations) <= _FEW else _plan_many(pattern)
+    plans = (
+        _plan_few(pattern) if len(observations) <= _FEW_AGENTS else _plan_many(pattern)
+    )
     groups = []
+    # A plan is a group without observed values, which are filled in here.
     for plan in plans:
         values = [v for agent in plan.agents.tolist() for _, v in observations[agent]]
         # All agents' values side by side, then one row for each agent: (*runs, G, M).
@@ -1228,6 +1336,7 @@ def copy_rng(rng: np.random.Generator) -> np.random.Generator:
     if type(rng) is not np.random.Generator:
         return copy.deepcopy(rng)
     old: Any = rng.bit_generator
+    # A bit generator with a cheap seed, whose state is then that of the old one
     new = type(old)(_UNSEEDED)
     # The seed sequence counts its children, so that each copy needs one of its own.
     new.__setstate__((old.state, copy.copy(old.seed_seq)))

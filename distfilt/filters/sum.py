@@ -25,8 +25,8 @@ from .step import Received, Step
 
 __all__ = ["GaussianSumFilter", "GaussianSumState"]
 
-_LEAST = -700.0
-"""The smallest logarithm of a weight."""
+_MIN_LOG = -700.0
+"""The smallest logarithm of a weight; its exponential is still above zero."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -156,7 +156,7 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         arrays = {
             "component_means": self._settle(means, weights),
             "component_covariances": np.array([mixture.covs for mixture in mixtures]),
-            "log_weights": np.log([np.exp(_LEAST) + m.weights for m in mixtures]),
+            "log_weights": np.log([np.exp(_MIN_LOG) + m.weights for m in mixtures]),
         }
         return {
             name: np.broadcast_to(value, (*runs, *value.shape)).copy()
@@ -170,9 +170,11 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
     def next_state(self, step: Step[Any]) -> Any:
         """Forecast all components, condition and weight them by the observations."""
         means, covs = self._forecast_components(step)
+        # Equal weights in failed runs; a copy, since groups of agents are weighted in place
         log_weights = step.keep_failed(step.state.log_weights, old=0.0).copy()
-        for _place, group in step.received():
+        for _time_index, group in step.received():
             self._condition_components(means, covs, log_weights, group, step)
+        # Angles of a mixture's components near each other, with their mean in [-period/2, period/2)
         return step.end(
             component_means=self._settle(means, np.exp(log_weights)),
             component_covariances=symmetrise(covs),
@@ -180,7 +182,11 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         )
 
     def _settle(self, means: Array, weights: Array) -> Array:
-        """Bring means (..., L, d) of mixtures onto one branch of each circle."""
+        """Shift angles of means (..., L, d) of mixtures by whole periods.
+
+        Each comes within half a period of the mixture's circular mean; then all are shifted alike,
+        so that their weighted mean is in [-period/2, period/2).
+        """
         if not self.periods:
             return means
         return settle(fold(means, self.periods, weights), self.periods, weights)
@@ -200,8 +206,8 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
     def _forecast_components(self, step: Step[Any]) -> tuple[Array, Array]:
         """Return the components' forecasts, (*runs, A, L, ...)."""
         state = step.state
-        # A bank of Gaussian filters: the components stand among the runs, (*runs, L, A, ...). Its
-        # state holds nothing to draw with and, jointly with the present, no earlier states.
+        # A bank of Gaussian filters: the L components count as runs, with axes (*runs, L, A, ...).
+        # The bank's state needs no generator, and its joint moments are the present ones alone.
         bank = copy(step)
         bank.state = GaussianState.construct(
             state.t,
@@ -212,7 +218,7 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
             dim=state.dim,
         )
         means, covs = self._forecast(bank)
-        # Back behind the agents, in arrays that may be changed in place.
+        # The axis of components behind that of agents again, in arrays that may be changed in place
         means = np.array(means.swapaxes(-3, -2))
         covs = np.array(covs.swapaxes(-4, -3))
         # Failed runs get harmless Gaussians, so that the batch can go on.
@@ -227,7 +233,11 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         group: Received,
         step: Step[GaussianSumState],
     ) -> None:
-        """Condition and weight the components of a group's agents, in place."""
+        """Condition and weight the components of a group's agents, in place.
+
+        The arrays are those of all agents, (*runs, A, L, ...).
+        """
+        # The index of the group's agents in these
         rows = group.rows
         mean = means[..., rows, :, :]
         cov = covs[..., rows, :, :, :]
@@ -235,11 +245,13 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         predictions = self._predict_components(mean, cov, group)
         predicted = predictions.values
         slope = predictions.slopes
+        # Which numbers a component cannot predict, (*runs, G, L, M), and which none can
         is_blind = np.isnan(predicted)
         is_unseen = np.asarray(is_blind.all(axis=-2))
         reason = "no component can see"
         if self.linearization == "extended":
-            # Nothing moves, and components that predict the same keep their weights.
+            # Where all derivatives are zero no component moves, and if all predict the same, their
+            # weights stay too: the observation has no effect.
             is_flat = ~slope.any(axis=(-3, -1)) & (np.ptp(predicted, axis=-2) == 0)
             if is_flat.any():
                 reason = "the sensor's derivative is zero at every component"
@@ -253,7 +265,7 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
             predicted,
             np.exp(logs),
             predicted_cov,
-            is_torn=True,
+            near_observed=True,
             is_gaussian=False,
         )
         target = group.target[..., None, :]
@@ -264,7 +276,7 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         # A covariance for each agent serves all of the agent's components.
         noise = group.noise[:, None] if group.noise.ndim == 3 else group.noise
         noise = noise + predictions.extra_covs
-        prior = np.where(contradicts, _LEAST, logs)
+        prior = np.where(contradicts, _MIN_LOG, logs)
         # All components of all agents and runs at once, or run by run if one fails.
         new_means, new_covs, new_logs, log_likelihoods = step.apply(
             _condition_bank,
@@ -282,7 +294,7 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         self, mean: Array, cov: Array, group: Received
     ) -> _Predictions:
         """Predict a group's observations by every component."""
-        # Components stand among the runs, so that a group predicts for each of them.
+        # Components count as runs, with axes (*runs, L, G, ...), so that a group predicts for each.
         mean = np.ascontiguousarray(mean.swapaxes(-3, -2))
         cov = np.ascontiguousarray(cov.swapaxes(-4, -3))
         # The group's target for each component.
@@ -301,7 +313,7 @@ class GaussianSumFilter(GaussianFamily, SharesObservations[Any]):
         slope = np.where(is_blind[..., None], 0.0, slope)
         if extra is None:
             extra = np.zeros((*shape, shape[-1]))
-        # Back behind the agents
+        # The axis of components behind that of agents again
         return _Predictions(
             values=predicted.swapaxes(-3, -2),
             slopes=slope.swapaxes(-4, -3),
@@ -343,7 +355,8 @@ def _condition_bank(
     """
     missing = np.asarray(np.isnan(innovation))
     is_pair = ~missing[..., :, None] & ~missing[..., None, :]
-    # Missing numbers have a zero innovation and a unit covariance, of which no log p depends.
+    # Missing numbers get a zero innovation and rows of the identity in S, which add nothing to
+    # log p(y).
     innovation_cov = slope @ cov @ slope.mT + noise
     unit = np.eye(innovation.shape[-1])
     lower = cholesky(np.where(is_pair, innovation_cov, unit))
@@ -355,13 +368,17 @@ def _condition_bank(
     joint = logs + log_density
     total = log_sum_exp(joint)
     new_mean, new_cov = condition(mean, cov, innovation, slope, noise)
-    return new_mean, new_cov, np.maximum(joint - total, _LEAST), total[..., 0]
+    return new_mean, new_cov, np.maximum(joint - total, _MIN_LOG), total[..., 0]
 
 
 def _mix(weights: Array, means: Array, covs: Array) -> _Moments:
-    """Return moments of mixtures: Σ w m, and Σ w (P + (m - m̄)(m - m̄)ᵀ)."""
+    """Return moments of mixtures: m̄ = Σ w m, and Σ w (P + (m - m̄)(m - m̄)ᵀ).
+
+    Weights are (..., L), means (..., L, d), and covariances P (..., L, d, d).
+    """
     mean = (weights[..., None, :] @ means)[..., 0, :]
     anomalies = means - mean[..., None, :]
+    # The sums over the L components, of the means' spread and of the covariances
     spread = (weights[..., None, :] * anomalies.mT) @ anomalies
     within = (weights[..., None, None] * covs).sum(axis=-3)
     return _Moments(mean, within + spread)

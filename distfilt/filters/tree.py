@@ -109,7 +109,7 @@ class ChannelFilter(GaussianFamily):
             raise ValueError(
                 "prior must be one for all agents, of which the links begin, got a list"
             )
-        # A known constant has no information matrix.
+        # Raises an error if the covariance has no inverse, as that of a known constant.
         moments_by_agent(prior, self.model.dim, self.n_agents, "definite")
         # Both ends of each link begin with the common prior.
         n_links = self.graph.senders.size
@@ -124,7 +124,8 @@ class ChannelFilter(GaussianFamily):
                 "agents must be all of them, whose neighbours have to know of it, got "
                 f"{len(reset.agents)} of {self.n_agents}"
             )
-        # The links forget as the agents do, or the common belief would no longer be common.
+        # The beliefs of the links, which both ends know, are reset like those of agents, or they
+        # would no longer be common.
         links = self._join_links(state, only_links=True)
         of_links = reset._replace(agents=list(range(self.graph.senders.size)))
         changed = reset_gaussian(links, of_links)
@@ -135,21 +136,22 @@ class ChannelFilter(GaussianFamily):
     def next_state(self, step: Step[GaussianState]) -> GaussianState:
         """Forecast agents and links, assimilate the agents' own observations, exchange."""
         n = self.n_agents
-        # Agents and links have the same forecast.
+        # Agents and links are forecast in one call, the E links behind the A agents.
         together = copy(step)
         together.state = self._join_links(step.state)
         all_means, all_covs = self._forecast(together)
         unit = np.eye(self.model.dim)
         means = step.check_forecast(all_means[..., :n, :], old=0.0)
         covs = step.check_forecast(all_covs[..., :n, :, :], old=unit)
-        for place, group in step.received():
-            means, covs = self._condition(means, covs, place, group, step)
-        # A run that has failed gets harmless Gaussians, so that the batch can go on.
+        for time_index, group in step.received():
+            means, covs = self._condition(means, covs, time_index, group, step)
+        # A run that has failed gets standard normals, so that the batch can go on.
         covs = step.keep_failed(covs, old=unit)
         link_means = step.keep_failed(all_means[..., n:, :], old=0.0)
         link_covs = step.keep_failed(all_covs[..., n:, :, :], old=unit)
         if step.channel is not None:
-            # Y_i + Σ (Y_j - Y_ij), and the links' new common beliefs
+            # Agent i's information Y_i + Σ (Y_j - Y_ij), that of its neighbours j without what the
+            # link knows; and the links' new common beliefs
             belief, common = fuse_on_tree(
                 (means, covs), (link_means, link_covs), step.channel
             )
@@ -167,6 +169,7 @@ class ChannelFilter(GaussianFamily):
         self, state: GaussianState, *, only_links: bool = False
     ) -> GaussianState:
         """Return a state whose agents are followed by the links, or the links alone."""
+        # A state of this filter has links, which are treated as further agents.
         with_links = cast(ChannelFilterState, state)
         means = with_links.link_means
         covs = with_links.link_covariances

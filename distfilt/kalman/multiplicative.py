@@ -247,8 +247,7 @@ def mekf(
             "observations must be predicted to be used, but a sensor cannot see from a mean "
             "(its prediction is NaN): these components are left out",
             RuntimeWarning,
-            # The warning points at the call of mekf(), above it and its validation.
-            stacklevel=3,
+            stacklevel=3,  # at the call of mekf(), above its validation
         )
     return unflatten_runs(means, covs, log_likelihood, runs)
 

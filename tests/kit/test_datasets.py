@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from bookkit import datasets
@@ -166,7 +167,9 @@ def test_the_truth_is_not_needed(tmp_path: Path) -> None:
     assert data.landmarks.index.tolist() == ["6"]
     assert data.landmarks.isna().all(axis=None)
     rng = np.random.default_rng(0)
-    with pytest.raises(DataError, match=r"no pose of robot 1, 2 at 0.5 s, .* none"):
+    with pytest.raises(
+        DataError, match=r"at t = 0.5 s: robot 1 has none, robot 2 has none"
+    ):
         data.start_poses(0.5, std=(0.1, 0.1, 0.1), rng=rng)
 
 
@@ -181,7 +184,7 @@ def test_first_poses_are_the_truth_with_errors(tmp_path: Path) -> None:
     errors = means - data.true_poses(np.array([1.0])).ravel()
     assert np.allclose(errors.std(axis=0), std, rtol=0.15)
     assert np.allclose(draws[0][1], np.diag(np.square(std)))
-    with pytest.raises(DataError, match=r"robot 1 at 9 s, it has 0.0 to 2.0 s"):
+    with pytest.raises(DataError, match=r"t = 9 s: robot 1 has 0.0 to 2.0 s"):
         data.start_poses(9.0, std=std, rng=np.random.default_rng(0))
 
 
@@ -194,6 +197,51 @@ def test_the_truth_has_gaps(tmp_path: Path) -> None:
     assert data.true_poses(np.array([1.0, 5.0]))[:, 0, 0].tolist() == [1.0, 5.0]
     filled = data.true_poses(np.array([3.0]), longest_gap=4.0)
     assert filled[0, 0, 0] == 3.0
+    with pytest.raises(DataError, match=r"robot 1 has a gap from 1.0 to 5.0 s"):
+        data.start_poses(3.0, std=(0.1, 0.1, 0.1), rng=np.random.default_rng(0))
+
+
+def test_a_gap_of_the_odometry_warns(tmp_path: Path) -> None:
+    """Ten inputs a second, then nothing for five seconds, in which the last one is held."""
+    times = [*np.arange(100.0, 103.0, 0.1), *np.arange(108.0, 110.0, 0.1)]
+    text = "".join(f"{t:.1f} 1.0 0.0\n" for t in times)
+    data = datasets.read_utias(write_utias(tmp_path, Robot1_Odometry=text))
+    with pytest.warns(RuntimeWarning, match=r"robot 1 has a gap from 2.9 to 8.0 s"):
+        _, rates = data.body_rates(0.5)
+    assert np.allclose(rates[:, 0], 1.0)
+
+
+def test_shorter_inputs_add_less_noise() -> None:
+    """Two clocks cut each input in two, with errors of their own: half of the variance."""
+    event = ("odometry", "", (1.0, 0.0), None)
+    events = [(t, "A", *event) for t in (0.0, 1.0)]
+    clocks = datasets.table.make_events([*events, (0.5, "B", *event)])
+    truth = pd.DataFrame(columns=["time", "robot", "x", "y", "heading"])
+    places = pd.DataFrame(columns=["x", "y"])
+    data = datasets.Dataset(clocks, truth, places, ("A", "B"))
+    variances = []
+    for times, rates in (data.body_rates(), data.body_rates(1.0)):
+        model = planar_odometry(times, rates, std=(0.1, 0.0, 0.0))
+        variances.append(model.noise_at(np.zeros(6), 0.0, 1.0)[0, 0])
+    assert np.allclose(variances, [0.1**2 / 2, 0.1**2])
+
+
+def test_a_repeated_line_is_one_observation(tmp_path: Path) -> None:
+    text = "100.5 14 2.5 0.1\n100.5 14 2.5 0.1\n100.5 14 2.5 0.2\n"
+    data = datasets.read_utias(write_utias(tmp_path, Robot1_Measurement=text))
+    ((_, group),) = data.by_step("range_bearing", 0.5).items()
+    assert [value.tolist() for _, _, value in group] == [[2.5, 0.1], [2.5, 0.2]]
+
+
+def test_a_landmark_without_a_surveyed_place(tmp_path: Path) -> None:
+    """It is in the state, and has no score."""
+    text = "1 5\n6 14\n7 15\n"
+    data = datasets.read_utias(write_utias(tmp_path, Barcodes=text))
+    assert data.landmarks.index.tolist() == ["6", "7"]
+    assert data.landmarks.loc["6"].tolist() == [3.0, 4.0]
+    assert data.landmarks.loc["7"].isna().all()
+    errors = datasets.score_landmarks(data, np.zeros(7), np.eye(7))
+    assert errors["place"].tolist()[0] == 25.0 and np.isnan(errors["place"].iloc[1])
 
 
 @pytest.mark.parametrize(
@@ -207,6 +255,23 @@ def test_the_truth_has_gaps(tmp_path: Path) -> None:
         ("Robot1_Measurement", "100 14 1 0\n100 9 1 0\n", r"dat:2: barcode 9 is not"),
         ("Barcodes", "1 5\n6 5\n", r"Barcodes.dat:2: barcode 5 comes twice"),
         ("Landmark_Groundtruth", "6 3 4\n", r"Groundtruth.dat:1: expected 5"),
+        ("Barcodes", "# nothing\n", r"Barcodes.dat: no line of barcodes"),
+        ("Robot1_Measurement", "100 14 -1 0\n", r"dat:1: a range must be positive"),
+        ("Robot1_Measurement", "100 14 1 0\n101 14 1 9\n", r"dat:2: .* in rad"),
+        # A turn of 30 degrees a second, and headings that turn by it
+        ("Robot1_Odometry", "100 0 30\n101 0 30\n", r"Odometry.dat: .* degrees"),
+        (
+            "Robot1_Groundtruth",
+            "100.0 0 0 0\n100.1 0 0 3\n100.2 0 0 6\n",
+            r"Groundtruth.dat: .* degrees",
+        ),
+        # Nanoseconds, and a clock that begins when the robot is switched on
+        ("Robot1_Odometry", "1e17 0 0\n", r"Odometry.dat: expected times in seconds"),
+        (
+            "Robot1_Odometry",
+            "1e6 0 0\n",
+            r"Odometry.dat: begins .* after .*Groundtruth.dat",
+        ),
     ],
 )
 def test_a_line_that_is_wrong_is_named(
@@ -348,6 +413,8 @@ def test_a_problem_with_ranges_by_hand(tmp_path: Path) -> None:
         ("VERTEX_SE2 11 L2 0 0 0", r"pyfg:12: expected a robot's letter"),
         ("VERTEX_SE3:QUAT 11 A2 0 0 0 0 0 0 1", r"pyfg:12: .* in space"),
         ("VERTEX_SE2 1.7e18 A2 0 0 0", r"pyfg:12: .* in seconds, .* nanoseconds"),
+        ("EDGE_RANGE 10.5 A1 L0 0 0.1", r"pyfg:12: a range must be positive"),
+        ("EDGE_SE2 10 A0 A1 0 0 9 1 0 0 1 0 1", r"pyfg:12: a turn must be in rad"),
         ("EDGE_FOO 1", r"pyfg:12: expected one of VERTEX_SE2, "),
     ],
 )
@@ -496,16 +563,20 @@ def write_bag(path: Path) -> None:
             "/odometry",
             types["geometry_msgs/msg/TwistStamped"](header=header(100.0), twist=twist),
         ),
-        (
-            "/radio",
-            types["sensor_msgs/msg/Range"](
-                header=header(100.25),
-                radiation_type=0,
-                field_of_view=0.0,
-                min_range=0.0,
-                max_range=9.0,
-                range=4.5,
-            ),
+        *(
+            (
+                "/radio",
+                types["sensor_msgs/msg/Range"](
+                    header=header(100.25),
+                    radiation_type=0,
+                    field_of_view=0.0,
+                    min_range=0.0,
+                    max_range=9.0,
+                    range=measured,
+                ),
+            )
+            # A radio that hears nobody, and one that hears an echo from too far
+            for measured in (4.5, np.inf, 9.5)
         ),
         (
             "/pose",
@@ -513,9 +584,12 @@ def write_bag(path: Path) -> None:
         ),
     ]
     with rosbag2.Writer(path, version=9) as writer:
+        connections: dict[str, Any] = {}
         for topic, message in messages:
             kind = message.__msgtype__
-            connection = writer.add_connection(topic, kind, typestore=store)
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            connection = connections[topic]
             raw = store.serialize_cdr(message, kind)
             writer.write(connection, 200_000_000_000, raw)
 
@@ -531,14 +605,51 @@ def test_a_log_of_the_robot_operating_system(tmp_path: Path) -> None:
     assert data.robots == ("r",) and data.origin == 100.0
     odometry = data.of_kind("odometry").iloc[0]
     assert odometry[["time", "speed", "turn_rate"]].tolist() == [0.0, 0.5, 0.2]
+    assert len(data.of_kind("range")) == 1 and data.dropped == 2
     measured = data.of_kind("range").iloc[0]
     assert measured[["time", "subject", "range"]].tolist() == [0.25, "anchor", 4.5]
     truth = data.truth.iloc[0]
     assert np.allclose(truth[["time", "x", "y", "heading"]].tolist(), [0.5, 1, 2, 1.2])
     with pytest.raises(DataError, match="no topic /lidar; there are /odometry"):
         datasets.read_bag(tmp_path / "log", {"/lidar": "r"})
+    for wrong, message in (
+        ({"/radio": "r"}, "/radio has ranges: name the robot and whom it ranges"),
+        ({"/pose": ("r", "s")}, "/pose is of one robot: give its name alone"),
+        ({}, "topics must name at least one topic"),
+    ):
+        with pytest.raises(DataError, match=message):
+            datasets.read_bag(tmp_path / "log", wrong)
     with pytest.raises(DataError, match="no such log"):
         datasets.read_bag(tmp_path / "other", topics)
+
+
+def test_a_log_of_ros_1_with_two_publishers_of_a_topic(tmp_path: Path) -> None:
+    """A driver that was restarted in between: both of its connections are read."""
+    rosbag1 = pytest.importorskip("rosbags.rosbag1")
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+    types = store.types
+    kind = "geometry_msgs/msg/TwistStamped"
+    path = tmp_path / "log.bag"
+    with rosbag1.Writer(path) as writer:
+        for k, caller in enumerate(("/driver_1", "/driver_2")):
+            connection = writer.add_connection(
+                "/wheels", kind, typestore=store, callerid=caller
+            )
+            stamp = types["builtin_interfaces/msg/Time"](sec=100 + k, nanosec=0)
+            vector = types["geometry_msgs/msg/Vector3"]
+            message = types[kind](
+                header=types["std_msgs/msg/Header"](seq=k, stamp=stamp, frame_id=""),
+                twist=types["geometry_msgs/msg/Twist"](
+                    linear=vector(x=1.0 + k, y=0.0, z=0.0),
+                    angular=vector(x=0.0, y=0.0, z=0.0),
+                ),
+            )
+            raw = store.serialize_ros1(message, kind)
+            writer.write(connection, 100_000_000_000, raw)
+    data = datasets.read_bag(path, {"/wheels": "r"})
+    odometry = data.of_kind("odometry")
+    assert odometry[["time", "speed"]].to_numpy().tolist() == [[0.0, 1.0], [1.0, 2.0]]
 
 
 def test_without_rosbags_the_error_says_what_to_install(

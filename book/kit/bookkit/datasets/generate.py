@@ -91,14 +91,14 @@ class _Drive:
     wheels: Array
     poses: Array
 
-    def pose_at(self, t: float, robot: int) -> Array:
-        """Return a robot's pose between two steps."""
+    def poses_at(self, t: float) -> Array:
+        """Return all robots' poses between two steps, (A, 3)."""
         # The last pose belongs to the last step, so that its end can be asked for.
         k = min(int(t / _STEP), len(self.wheels) - 1)
         fraction = t / _STEP - k
         # Headings run on, so that they can be interpolated like the places.
-        start = self.poses[k, robot]
-        return np.asarray(start + fraction * (self.poses[k + 1, robot] - start))
+        start = self.poses[k]
+        return np.asarray(start + fraction * (self.poses[k + 1] - start))
 
 
 def _simulate(
@@ -134,7 +134,8 @@ def _simulate(
         # Up to 0.3 m/s, a tenth of it away from the goal's direction; at most 0.6 rad/s.
         speed = 0.3 * np.clip(np.cos(error), 0.1, None)
         turn_rate = np.clip(1.0 * error, -0.6, 0.6)
-        wheels[k] = np.stack([speed, turn_rate], axis=-1)
+        wheels[k, :, 0] = speed
+        wheels[k, :, 1] = turn_rate
         # A slip slows the body down, and the wheels do not notice.
         poses[k + 1] = _drive(pose, factor[k] * speed, turn_rate)
     return _Drive(wheels, poses)
@@ -263,21 +264,18 @@ def _look(
     for t in np.arange(0.3 + 0.4 * rng.random(), end, 0.5).tolist():
         if blind_from <= t < blind_from + defects.gap:
             continue
-        pose = drive.pose_at(t, robot)
-        for subject in range(n_subjects):
-            if subject == robot:
-                continue
-            # Another robot's centre bears its barcode.
-            if subject < n_robots:
-                place = drive.pose_at(t, subject)[:2]
-            else:
-                place = places[subject - n_robots]
-            offset = place - pose[:2]
-            distance = float(np.hypot(*offset))
-            bearing = np.arctan2(offset[1], offset[0]) - pose[2]
-            bearing = float((bearing + np.pi) % (2 * np.pi) - np.pi)
-            if distance > _RANGE_LIMIT or abs(bearing) > _HALF_VIEW:
-                continue
+        poses = drive.poses_at(t)
+        pose = poses[robot]
+        # Robots' centres bear their barcodes, and landmarks come behind them.
+        offsets = np.concatenate([poses[:, :2], places]) - pose[:2]
+        distances = np.hypot(offsets[:, 0], offsets[:, 1])
+        bearings = np.arctan2(offsets[:, 1], offsets[:, 0]) - pose[2]
+        bearings = (bearings + np.pi) % (2 * np.pi) - np.pi
+        is_seen = (distances <= _RANGE_LIMIT) & (np.abs(bearings) <= _HALF_VIEW)
+        is_seen[robot] = False
+        for subject in np.flatnonzero(is_seen).tolist():
+            distance = float(distances[subject])
+            bearing = float(bearings[subject])
             # Contaminated normal errors: some are five times as wide.
             width = np.where(rng.random(2) < defects.outliers, 5.0, 1.0)
             errors = width * np.array(noise[2:]) * rng.standard_normal(2)

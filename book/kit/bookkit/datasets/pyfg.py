@@ -24,7 +24,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from .table import POSE, Array, DataError, Dataset, Event, LineReader, make_events
+from .table import (
+    LATEST,
+    POSE,
+    Array,
+    DataError,
+    Dataset,
+    Event,
+    LineReader,
+    make_events,
+)
 
 __all__ = ["read_pyfg"]
 
@@ -46,10 +55,6 @@ _KINDS = {
     "EDGE_SE2_XY": "offset",
     "EDGE_RANGE": "range",
 }
-
-
-LATEST = 1e11
-"""A clock in seconds shows less, for three thousand years to come."""
 
 
 def read_pyfg(path: str | Path, *, time_unit: float = 1.0) -> Dataset:
@@ -74,7 +79,8 @@ def read_pyfg(path: str | Path, *, time_unit: float = 1.0) -> Dataset:
     DataError
         With file and line: an unknown kind of line, one of a problem in space, a short line, a
         pose that no ``VERTEX_SE2`` declares, odometry between poses that are not successive,
-        times of one robot's poses that decrease, or that are no seconds.
+        times of one robot's poses that decrease, or that are no seconds, a turn by more than a
+        whole one, a range that is not positive.
     """
     reader = LineReader(Path(path))
     lines = [_read_line(reader, number, words) for number, words in reader.lines]
@@ -131,8 +137,19 @@ def _read_line(reader: LineReader, number: int, words: list[str]) -> Line:
     # The time stands before the names; landmarks have none.
     first = 1 if fields.startswith("time") else 0
     names = values[first : first + n_names]
-    numbers = values[:first] + values[first + n_names :]
-    return number, word, names, reader.numbers(number, numbers, fields)
+    texts = values[:first] + values[first + n_names :]
+    numbers = reader.numbers(number, texts, fields)
+    by_name = dict(zip(fields.split(), numbers, strict=True))
+    if by_name.get("range", 1.0) <= 0:
+        raise reader.error(
+            number, f"a range must be positive, got {by_name['range']:g}"
+        )
+    # The logarithm of a pose has no more than half a turn; some writers let it run on.
+    if abs(by_name.get("turn", 0.0)) > 2 * np.pi:
+        raise reader.error(
+            number, f"a turn must be in rad, up to a whole one, got {by_name['turn']:g}"
+        )
+    return number, word, names, numbers
 
 
 def _read_poses(

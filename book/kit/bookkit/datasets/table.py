@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +20,7 @@ __all__ = [
     "DataError",
     "Dataset",
     "LineReader",
+    "check_clocks",
     "locate",
     "make_events",
     "stack_events",
@@ -44,6 +46,12 @@ _COLUMNS = ("time", "robot", "kind", "subject", *_VALUE_COLUMNS, "cov")
 
 Event = tuple[float, str, str, str, tuple[float, ...], Array | None]
 """Time, robot, kind, subject, values and their covariance, if the file has one."""
+
+LATEST = 1e11
+"""A clock in seconds shows less, for three thousand years to come."""
+
+_DAY = 86400.0
+"""In s; streams of one log begin within a day of each other."""
 
 
 class DataError(ValueError):
@@ -88,7 +96,7 @@ class LineReader:
         if len(words) != n_expected:
             raise self.error(
                 number,
-                f"expected {n_expected} numbers ({names}), got {len(words)}",
+                f"expected {n_expected} numbers ({names}) between spaces, got {len(words)}",
             )
         values = []
         for word in words:
@@ -122,9 +130,21 @@ class LineReader:
             # Equal times are allowed: a camera sees several barcodes in one picture.
             late = np.flatnonzero(np.diff(times) < 0)
             if late.size:
-                number, _ = self.lines[late[0] + 1]
-                raise self.error(number, "times must not decrease")
+                number, words = self.lines[late[0] + 1]
+                column = names.split().index("time")
+                _, before = self.lines[late[0]]
+                raise self.error(
+                    number,
+                    f"times must not decrease, got {words[column]} after {before[column]}: "
+                    "sort the lines by time",
+                )
         return table
+
+    def refuse_rows(self, is_wrong: NDArray[np.bool_], text: str) -> None:
+        """Raise an error about the first line that is wrong, if one is."""
+        if is_wrong.any():
+            number, words = self.lines[int(np.argmax(is_wrong))]
+            raise self.error(number, f"{text}, got {' '.join(words)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,10 +232,12 @@ class Dataset:
         """Return the observations of one kind by the nearest multiple of `dt`.
 
         Each is a robot, a subject and the values. A robot that observes itself has read a wrong
-        name, and is left out.
+        name, and is left out; so is a line that repeats another one.
         """
         rows = self.of_kind(kind)
         rows = rows[rows["robot"] != rows["subject"]]
+        # The same line twice is one observation, and does not confirm itself.
+        rows = rows.drop_duplicates(["time", "robot", "subject", *VALUES[kind]])
         steps = np.rint(rows["time"] / dt).astype(int)
         values = rows[list(VALUES[kind])].to_numpy(dtype=float)
         groups: dict[int, list[tuple[str, str, Array]]] = {}
@@ -247,10 +269,23 @@ class Dataset:
         ------
         DataError
             If no robot has odometry or displacements.
+
+        Warns
+        -----
+        RuntimeWarning
+            If an input of odometry has to hold for more than a second, and ten times longer than
+            the robot's inputs usually do: the log has a gap.
+
+        Notes
+        -----
+        The errors of two inputs are independent for `planar_odometry`, so the same `std` adds less
+        noise if inputs are shorter. By default they are shorter the more robots have clocks of
+        their own. With `dt` a setting means the same for every log.
         """
-        pieces = [self._list_inputs(robot) for robot in self.robots]
+        pieces = self._inputs
         if not any(len(begins) for begins, _ in pieces):
             raise DataError("events: none of odometry or displacement")
+        self._warn_of_gaps()
         if dt is None:
             knots = np.unique(np.concatenate([begins for begins, _ in pieces]))
         else:
@@ -271,6 +306,28 @@ class Dataset:
                 at_edges = np.interp(edges, nodes, integral[:, j])
                 rates[:, k, j] = np.diff(at_edges) / np.diff(edges)
         return knots, rates.reshape(len(knots), -1)
+
+    @cached_property
+    def _inputs(self) -> list[tuple[Array, Array]]:
+        """When each input of each robot begins, (N,), and its rates, (N, 3)."""
+        return [self._list_inputs(robot) for robot in self.robots]
+
+    def _warn_of_gaps(self) -> None:
+        """Warn of odometry that is missing for long."""
+        end = float(self.events["time"].max())
+        has_odometry = self.events.loc[self.events["kind"] == "odometry", "robot"]
+        for robot in has_odometry.unique():
+            begins, _ = self._inputs[self.robots.index(robot)]
+            held = np.diff(np.append(begins, end))
+            longest = int(np.argmax(held))
+            if held[longest] > max(1.0, 10 * float(np.median(held))):
+                start = begins[longest]
+                warnings.warn(
+                    f"odometry of robot {robot} has a gap from {start:.1f} to "
+                    f"{start + held[longest]:.1f} s, in which its last input is held",
+                    RuntimeWarning,
+                    stacklevel=3,
+                )
 
     def _list_inputs(self, robot: str) -> tuple[Array, Array]:
         """Return when each input of a robot begins, (N,), and its rates, (N, 3)."""
@@ -349,21 +406,23 @@ class Dataset:
         ]
         if unknown:
             raise DataError(
-                f"truth: no pose of robot {', '.join(unknown)} at {t:g} s, it has "
-                f"{self._describe_truth(unknown)}"
+                f"truth must have each robot's pose at t = {t:g} s: "
+                + ", ".join(self._describe_truth(robot, t) for robot in unknown)
             )
         errors = np.asarray(std) * rng.standard_normal(poses.shape)
         variances = np.tile(np.square(std), len(poses))
         return (poses + errors).ravel(), np.diag(variances)
 
-    def _describe_truth(self, robots: Sequence[str]) -> str:
-        """Say from when to when the truth of some robots is known."""
-        spans = []
-        for robot in robots:
-            logged, _ = self._tracks[self.robots.index(robot)]
-            span = f"{logged[0]:.1f} to {logged[-1]:.1f} s" if logged.size else "none"
-            spans.append(span)
-        return ", ".join(spans)
+    def _describe_truth(self, robot: str, t: float) -> str:
+        """Say which truth of a robot there is around a time."""
+        logged, _ = self._tracks[self.robots.index(robot)]
+        if not logged.size:
+            return f"robot {robot} has none"
+        if not logged[0] <= t <= logged[-1]:
+            return f"robot {robot} has {logged[0]:.1f} to {logged[-1]:.1f} s"
+        upper = np.searchsorted(logged, t)
+        begin, end = logged[upper - 1], logged[upper]
+        return f"robot {robot} has a gap from {begin:.1f} to {end:.1f} s"
 
     def true_poses(self, times: Array, *, longest_gap: float = 1.0) -> Array:
         """Return each robot's true pose at `times`, (T, A, 3), for scores alone.
@@ -377,17 +436,16 @@ class Dataset:
                 continue
             # The truth is not extrapolated.
             inside = (times >= logged[0]) & (times <= logged[-1])
-            # The logged pose at or after each time; the one before it is its neighbour.
-            upper = np.searchsorted(logged, times).clip(1, max(len(logged) - 1, 1))
-            is_known = inside
-            if len(logged) > 1:
-                gap = logged[upper] - logged[upper - 1]
-                # A logged pose is known, whatever is around it.
-                is_logged = np.isin(times, logged)
-                is_known = inside & ((gap <= longest_gap) | is_logged)
-            for j in range(3):
-                series = np.interp(times, logged, values[:, j])
-                poses[:, k, j] = np.where(is_known, series, np.nan)
+            # The logged pose at or before each time, and the next one
+            lower = np.searchsorted(logged, times, side="right").clip(1) - 1
+            upper = np.minimum(lower + 1, len(logged) - 1)
+            gap = logged[upper] - logged[lower]
+            # A logged pose is known, whatever is around it.
+            is_logged = logged[lower] == times
+            is_known = inside & ((gap <= longest_gap) | is_logged)
+            part = (times - logged[lower]) / np.where(gap > 0, gap, 1.0)
+            series = values[lower] + part[:, None] * (values[upper] - values[lower])
+            poses[is_known, k] = series[is_known]
         return poses
 
     def true_state(self, t: float) -> Array:
@@ -434,6 +492,37 @@ def locate(name: str) -> Path | None:
         raise DataError(f"{folder}: DISTFILT_DATA must be a folder, and is not there")
     path = folder / name
     return path if path.exists() else None
+
+
+def check_clocks(times_by_stream: Mapping[str, Array]) -> None:
+    """Refuse the times of a log whose streams have no clock in common, or one not in seconds.
+
+    Raises
+    ------
+    DataError
+        That names a stream.
+
+    Examples
+    --------
+    >>> check_clocks({"wheels": np.array([1.3e9]), "camera": np.array([1.3e18])})
+    Traceback (most recent call last):
+    bookkit.datasets.table.DataError: camera: expected times in seconds, got 1.3e+18
+    """
+    begins = {
+        name: times.min() for name, times in times_by_stream.items() if times.size
+    }
+    for name, begin in begins.items():
+        if abs(begin) > LATEST:
+            raise DataError(f"{name}: expected times in seconds, got {begin:.4g}")
+    if not begins:
+        return
+    first = min(begins, key=begins.__getitem__)
+    last = max(begins, key=begins.__getitem__)
+    if begins[last] - begins[first] > _DAY:
+        raise DataError(
+            f"{last}: begins at {begins[last]:.1f} s, more than a day after {first} at "
+            f"{begins[first]:.1f} s: bring all times to one clock"
+        )
 
 
 def make_events(events: Sequence[Event]) -> pd.DataFrame:
