@@ -663,7 +663,8 @@ class SensorFilter(Filter[S]):
             exchanges = self.share_observations or self.fusion is not None
             if exchanges and self.n_agents > 1:
                 raise ValueError(
-                    f"graph must be a Graph of {self.n_agents} agents, got None"
+                    f"graph must be a Graph of {self.n_agents} agents, got None: agents "
+                    "without one need share_observations=False, and no fusion"
                 )
         elif not callable(self.graph):
             # A fixed graph is converted once. The dataclass is frozen, so the field is set past it.

@@ -170,5 +170,5 @@ class RejectionStreaks:
         return (
             f"observations must pass the gate to be used, but agent {agent}'s has rejected the "
             f"last {LIMIT} of kind {kind!r}{origin}: the belief may have lost its target, with a "
-            "covariance that is too small, or the sensor's noise is larger than told"
+            "covariance that is too small, or the sensor's noise is larger than its covariance says"
         )

@@ -103,7 +103,8 @@ def read_observations(
     >>> [[o.value for o in agent] for agent in read_observations(f, [[1.5]], (), 0.0)]
     [[array([1.5])]]
     """
-    if are_observations(observations) and len(observations):
+    # Observations of any agents; an empty list is a time without any.
+    if are_observations(observations):
         observations = _sort_by_agent(observations, f.n_agents)
     result: list[list[Observation]] = []
     for agent, entry in enumerate(list_by_agent(observations, f.n_agents)):

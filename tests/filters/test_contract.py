@@ -91,6 +91,14 @@ def test_faults_between_two_times(family: str) -> None:
 
 
 @EACH
+@pytest.mark.parametrize("agents", [1, 3])
+def test_an_empty_list_is_a_time_without_observations(family: str, agents: int) -> None:
+    f, start = make_filter(family, agents=agents)
+    expected = f.step(start, TIMES[0], [None] * agents)
+    assert same(f.step(start, TIMES[0], []), expected)
+
+
+@EACH
 def test_recorded_scores_by_their_definitions(family: str) -> None:
     f, start = make_filter(family, runs=(3,), agents=3, names=("A", "B", "C"))
     truth, seen = data(f.sensors, (3,))
