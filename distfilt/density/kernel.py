@@ -451,7 +451,7 @@ def _undo_rounding(x: Array, grid: Grid, step: Array) -> Array:
     ratios = np.array([0.6180339887, 0.7548776662, 0.8191725134])[: grid.dim]
     ranks = np.empty(len(x))
     ranks[np.lexsort(x.T)] = np.arange(len(x))
-    # Offsets in [-½, ½). Any start of the sequence would do; here it is 1.5.
+    # Offsets in [-½, ½). Every start of the sequence would do; here it is 1.5.
     offsets = ((ranks[:, None] + 1.5) * ratios) % 1 - 0.5
     moved = x + offsets * step
     # Reflected at the walls, as the kernels are.

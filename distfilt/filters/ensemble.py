@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property, partial
 from inspect import signature
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
+from typing import Annotated, ClassVar, Literal, TypeVar, cast
 
 import numpy as np
 
@@ -410,8 +410,7 @@ class EnsembleFilter(
         self,
         h: Array,
         y: Array,
-        # Any: arrays, and a generator as the last.
-        *args: Any,
+        *args: Array,
         has_places: bool,
         predict: Callable[[Array], Array] | None,
         batch_shape: tuple[int, ...],
@@ -433,7 +432,9 @@ class EnsembleFilter(
         batch_shape : tuple of int
             Shape of the whole batch's predictions.
         """
-        *arrays, noise, rng = args
+        *arrays, noise, last = args
+        # The only argument that is no array
+        rng = cast(np.random.Generator, last)
         places = arrays.pop() if has_places else None
         *past, present = arrays
         # The function predicts for the whole batch, not for a single run and agent.

@@ -701,7 +701,7 @@ def _nees(error: Array, cov: Array) -> Array:
     correlation, unit = to_unit_variances(cov)
     # The smallest eigenvalue of a correlation is zero up to rounding, some 1e-16 times d.
     is_singular = np.linalg.eigvalsh(correlation)[..., 0] <= 1e-12
-    # Any definite matrix serves there, since the result is replaced.
+    # Every definite matrix serves there, since the result is replaced.
     correlation[is_singular] = np.eye(correlation.shape[-1])
     nees = quadratic_form(cholesky(correlation), error / unit)
     return np.where(is_singular, np.inf, nees)
