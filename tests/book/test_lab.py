@@ -274,6 +274,10 @@ def _run_all(address: str, stem: str, scratch: Path) -> None:
     )
     with chromium(scratch / "profile") as driver:
         driver.set_script_timeout(600)
+        # Newer browsers give a page without a window no focus, and JupyterLab runs the notebook
+        # that has it.
+        focus = {"enabled": True}
+        driver.execute_cdp_cmd("Emulation.setFocusEmulationEnabled", focus)
         driver.get(f"{address}/lab/tree/{stem}.ipynb")
         # Cells that are run before the kernel is there make JupyterLab ask for one.
         ready = (
