@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 from typing import Any
 
@@ -17,7 +18,7 @@ from distfilt.linalg import SolverError
 from distfilt.network import Graph, average_consensus, graphs
 from distfilt.sensors import Sensor, component, stack
 
-from .families import NOISE, PRIOR, TIMES, data, model
+from .families import NOISE, PRIOR, TIMES, data, model, still_model
 
 FOUR: list[Sensor | None] = [
     component([0], std=0.6),
@@ -159,6 +160,24 @@ def test_weights_of_a_run_that_failed_are_no_collapse(
     with pytest.warns(ParticleCollapse, match=message):
         state = f.step(start, 0.5, [[[0.3], [3e4]]])
     assert state.failed.tolist() == [False, True]
+
+
+@pytest.mark.parametrize(("size", "warns"), [(1.3, True), (1.9, True), (2.1, False)])
+def test_a_warning_below_an_effective_size_of_two(size: float, warns: bool) -> None:
+    # One member has the weight w and three have (1 - w) / 3: 1 / N_eff = w² + (1 - w)² / 3.
+    w = np.roots([4.0, -2.0, 1.0 - 3.0 / size]).max()
+    # The observed value is that of the first; the others have the likelihood exp(-v²/2).
+    v = np.sqrt(2 * np.log(3 * w / (1 - w)))
+    members = np.array([[0.0], [v], [v], [v]])
+    f = TransportFilter(still_model(1), [component([0], std=1.0)], members=4)
+    state = f.start(([0.0], [[1.0]]), rng=default_rng(0))
+    state = state.replace(ensembles=members[None])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", ParticleCollapse)
+        f.step(state, 0.0, [[0.0]])
+    collapses = [one for one in caught if one.category is ParticleCollapse]
+    assert bool(collapses) == warns
+    assert all("effective size" in str(one.message) for one in collapses)
 
 
 def test_a_step_without_any_reading_moves_nothing() -> None:
